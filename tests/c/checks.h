@@ -15,7 +15,7 @@
                       : (failures++, printf("%s:%d: %s: %s\n", __FILE__, __LINE__, row, #truth), 0))
 
 static int checks, failures;
-static const char *row = ""; /* name of the present check, for the report */
+static const char *row = ""; /* name of the current check, for the report */
 
 static inline uint8_t *page_end(void)
 {

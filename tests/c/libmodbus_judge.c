@@ -1,5 +1,5 @@
-/* Print how libmodbus decodes frames. Each line of standard input is a case; its result is a line of standard
- * output.
+/* Print how libmodbus decodes frames. Each line of standard input is a case. For each case, a line of
+ * standard output has the result.
  *
  * libmodbus reads from a socket pair that ends after the frame, so that no read waits.
  *   "request FRAME"
@@ -169,7 +169,7 @@ int main(void)
     map = modbus_mapping_new(CELLS, CELLS, CELLS, CELLS);
     if (!peer || !map)
         return 1;
-    modbus_set_response_timeout(peer, 0, 1000); /* libmodbus sleeps so long before exception 03 */
+    modbus_set_response_timeout(peer, 0, 1000); /* libmodbus also sleeps this long before exception 03 */
     fill();
     while (fgets(line, sizeof line, stdin)) {
         if (sscanf(line, "request %s", first) == 1)

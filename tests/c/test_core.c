@@ -12,7 +12,7 @@
 /* ---- frames printed in manuals ---- */
 
 struct frame {
-    int framing, is_reply, result; /* result: what the parser must return for the whole frame */
+    int framing, is_reply, result; /* result: the parser's return value for the whole frame */
     uint8_t bytes[MD_MOST_FRAME];
     size_t len;
 };
@@ -66,7 +66,7 @@ static void check_line(const struct frame *frame, const struct md_message *reque
     static struct md_line line;
     static struct md_completion completion;
     struct md_history history = {0};
-    /* `proofs` is NULL: only exchanges that are proofs may read the list. */
+    /* `proofs` is NULL with a count above 0, to check that this exchange does not read the list */
     struct md_drive drive = {.least_timeout_ns = 1000000, .most_timeout_ns = 1000000, .history = &history,
                              .proofs = NULL, .proof_count = MD_MOST_PROOFS};
     struct md_exchange exchange = {.framing = frame->framing, .request = *request, .character_ns = 1000,
@@ -93,7 +93,7 @@ static void check_behind_junk(const struct frame *frame, const struct md_message
     for (size_t junk_len = 0; junk_len <= sizeof junk; junk_len++)
         for (size_t step = 1; step <= 64; step *= 4)
             check_line(frame, request, junk, junk_len, step);
-    check_line(frame, request, frame->bytes, 2, 1); /* here the junk is the first two bytes of the frame */
+    check_line(frame, request, frame->bytes, 2, 1); /* here the junk is the frame's first two bytes */
 }
 
 /* Convert "01 03 ..." or ":0103...\r\n" (with escapes) to bytes. */
@@ -110,7 +110,7 @@ static size_t read_bytes(const char *text, uint8_t *bytes)
     return len;
 }
 
-/* A reply in the file belongs to the last well-formed request before it. */
+/* A reply in the file answers the last valid request before it. */
 static void check_documents(const char *path)
 {
     char text[512], model[32], framing[16], direction[16], bytes[256], verdict[32];
@@ -130,7 +130,7 @@ static void check_documents(const char *path)
         frame.len = read_bytes(bytes, frame.bytes);
         frame.result = strcmp(verdict, "bad checksum") == 0 ? MD_BAD_CHECKSUM : (int)frame.len;
         if (strcmp(verdict, "bad content") == 0 && frame.is_reply && frame.bytes[1] == 0x04)
-            frame.result = MD_BAD_LENGTH; /* its byte count does not match the request */
+            frame.result = MD_BAD_LENGTH; /* the reply's byte count does not match the request */
         check_parse(&frame, &request);
         if (frame.is_reply && frame.result > 0)
             check_behind_junk(&frame, &request);
@@ -258,7 +258,7 @@ static void check_builders(void)
 /* ---- after which byte the parser knows the result ---- */
 
 static const struct {
-    const char *name, *bytes; /* the parser knows the result at the last byte, not earlier */
+    const char *name, *bytes; /* the result is known at the last byte, not earlier */
     int framing, result;
     struct md_message request; /* if empty, `bytes` are a request, otherwise a reply to it */
 } verdicts[] = {

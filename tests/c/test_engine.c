@@ -31,7 +31,7 @@ static void make(struct subject *subject)
     subject->exchange.request = (struct md_message){.address = 1, .function = 3, .start = 1, .count = 1};
 }
 
-/* Repeat these steps: open a port, carry out exchanges, replace the drive by a second one, close the port. */
+/* Repeatedly open a port, carry out exchanges, replace the drive by a second one, and close the port. */
 static void *come_and_go(void *argument)
 {
     uint32_t number = *(uint32_t *)argument;
@@ -50,7 +50,7 @@ static void *come_and_go(void *argument)
         assert(port);
         md_port_report(port, row_queue, number);
         md_port_submit(port, queued, at_once, QUEUED);
-        if (i % 3) /* otherwise the port is closed during an exchange */
+        if (i % 3) /* every third time, the port is closed during an exchange */
             while (md_port_is_asking(port, &first.drive))
                 usleep(100);
         md_port_inherit(port, &second.drive, &first.drive);

@@ -4,7 +4,7 @@
 
 static ssize_t counted(int fd, void *bytes, size_t room);
 #define read counted
-#define send send_request /* the included file has a static function send() that differs from the system's */
+#define send send_request /* the included file's static send() would clash with the system's */
 #include "port.c"
 #undef send
 #undef read
@@ -38,7 +38,7 @@ static void *answer(void *argument)
         ssize_t put = write(fd, frame, (size_t)length);
         assert(got == REQUEST && put == length);
     }
-    /* The client sends one more request only when it has all replies. */
+    /* A further request shows that the engine has all replies. */
     ssize_t got = recv(fd, request, sizeof request, MSG_WAITALL);
     assert(got == REQUEST);
     return NULL;

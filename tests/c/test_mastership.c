@@ -1,5 +1,6 @@
-/* The core checks CLOCK_BOOTTIME right before each write(2), and does not send requests without mastership.
- * This test replaces the clock and write(2); the engine, its thread and the kernel's timer are real. */
+/* The core sends requests only while the process is master of the line: it checks CLOCK_BOOTTIME right before
+ * each write(2). This test replaces the clock and write(2); the engine, its thread and the kernel's timer are
+ * real. */
 #define _GNU_SOURCE
 #include <signal.h>
 #include <stdint.h>
@@ -18,7 +19,7 @@ static ssize_t noted_write(int fd, const void *bytes, size_t len);
 #undef clock_gettime
 #include "rs485.c"
 #undef write
-#define send send_request /* the included file has a static function send() that differs from the system's */
+#define send send_request /* the included file's static send() would clash with the system's */
 #include "port.c"
 #undef send
 
@@ -34,7 +35,7 @@ static const int64_t BEGIN_NS = INT64_C(5000) * MD_SECOND_NS; /* start of the te
 
 static _Atomic int64_t boottime_ns;
 static atomic_int looks, looks_written, written, most_written;
-static _Atomic int64_t passes_ns; /* time by which the clock advances in each write */
+static _Atomic int64_t passes_ns; /* how far the test's clock advances in each write */
 
 static int told_clock(clockid_t clock, struct timespec *now)
 {
@@ -90,7 +91,7 @@ static void make(void)
 {
     reading.request = (struct md_message){.address = 1, .function = 3, .start = 1, .count = 1};
     stop = reading;
-    stop.drive = &other; /* another drive: a late reply to the stop must not delay `reading` */
+    stop.drive = &other; /* so that a late reply to the stop cannot delay `reading` */
     stop.insists = 1;
     atomic_store(&boottime_ns, BEGIN_NS);
     atomic_store(&most_written, 1000);
@@ -115,7 +116,7 @@ static void check_unsent(const struct md_exchange *exchange)
     uint32_t failures = drive.failures;
     struct md_completion found = carry_out(exchange);
     assert(found.result == MD_NOT_MASTER && found.sent_ns == 0 && atomic_load(&written) == 0);
-    assert(drive.failures == failures); /* does not count as a failure of the drive */
+    assert(drive.failures == failures); /* an unsent request is not a failure of the drive */
 }
 
 static int64_t left_of_timer(void)
@@ -132,8 +133,8 @@ static int64_t real_boottime_ns(void)
     return now.tv_sec * MD_SECOND_NS + now.tv_nsec;
 }
 
-/* Extend the mastership by `ns` of the test's clock. The kernel's timer uses the real clock, and is an hour
- * away. */
+/* Extend the mastership by `ns` of the test's clock. The kernel's timer uses the real clock. It is set to an
+ * hour, so that it never fires. */
 static void extend(int64_t ns)
 {
     int64_t kill_ns = real_boottime_ns() + 3600 * MD_SECOND_NS;
@@ -153,7 +154,7 @@ static void check_listens_no_more(void)
 {
     struct md_completion found;
     int tries = 0;
-    do /* repeat: on a busy machine an exchange may be delayed for as long as by listening */
+    do /* repeat, because a busy machine may delay an exchange by as much as listening does */
         found = carry_out(&reading);
     while (found.sent_ns - found.begun_ns >= 30 * MS && tries++ < 20);
     assert(found.sent_ns - found.begun_ns < 30 * MS);
@@ -227,7 +228,7 @@ static void check_all_foreign_bytes_are_counted(void)
     md_listen_receive(&line, 3, 10);
     md_listen_receive(&line, 4, 20);
     assert(line.foreign == 7 && line.listened_ns == 25);
-    line.transactions = 1; /* on a network such bytes may be a late reply to this process */
+    line.transactions = 1; /* on a network, bytes may be late replies to this process */
     md_listen_receive(&line, 3, 30);
     assert(line.foreign == 7 && line.listened_ns == 25);
 }
@@ -265,7 +266,7 @@ static void check_other_master(void)
     pthread_t other, reader;
     struct md_completion found, stopped;
     extend(MD_SECOND_NS);
-    reading.character_ns = 2 * MS; /* so `reading` listens for half a second */
+    reading.character_ns = 2 * MS; /* so that `reading` listens for half a second */
     atomic_store(&is_babbling, 1);
     pthread_create(&other, NULL, babble, NULL);
     found = carry_out(&reading);
@@ -283,7 +284,7 @@ static void check_other_master(void)
         ;
     check_sent(&reading); /* the other master is silent now */
 
-    /* a stop is sent while the reading still listens; the reading is sent afterwards */
+    /* a stop is sent while `reading` still listens; `reading` is sent after that */
     md_mastership_end(mastership);
     check_unsent(&reading);
     extend(MD_SECOND_NS);
@@ -306,12 +307,12 @@ int main(void)
     mastership = md_mastership_new(0);
     assert(mastership);
     md_port_fence(port, mastership);
-    check_unsent(&reading); /* the mastership was never extended */
+    check_unsent(&reading); /* the process was never master */
     check_unsent(&stop);
     extend(1000);
     check_sent(&stop);
     check_listens_first();
-    md_port_fence(port, mastership); /* fenced again: listen again */
+    md_port_fence(port, mastership); /* after a new fence, the port must listen again */
     check_listens_first();
     check_listens_after_a_lapse();
     check_guard_comes_first();

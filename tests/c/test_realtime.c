@@ -52,7 +52,7 @@ static void test_a_thread_that_hangs_ends_the_process(void)
     if (!child) {
         struct md_realtime realtime = {0};
         md_realtime_start(&realtime);
-        realtime.used_ns = used_ns() - MOST_CPU_NS; /* as if no check came for so long */
+        realtime.used_ns = used_ns() - MOST_CPU_NS; /* used since the last check */
         set_timer(&realtime);
         for (;;)
             ;

@@ -26,7 +26,7 @@ int main(void)
     struct md_row_queue *row_queue = md_row_queue_new(ROWS, 1);
     assert(row_queue);
     for (int64_t n = 0; n < ROWS; n++) {
-        ahead_ns = n < ROWS / 2 ? 1000 : 7000; /* half-way, the time of day is set, or the machine slept */
+        ahead_ns = n < ROWS / 2 ? 1000 : 7000; /* half-way, the clock is set, or the machine slept */
         struct md_completion completion = {.result = MD_NO_REPLY, .begun_ns = (n + 1) * every_ns};
         if (n == ROWS / 2) { /* this request was sent before the clock change, and timed out after it */
             completion.sent_ns = completion.begun_ns;

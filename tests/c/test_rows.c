@@ -123,7 +123,7 @@ static void check_tap(void)
     struct md_tap tap = {.ring = ring, .room = ROOM};
     row = "tap";
     for (int round = 0; round < 100; round++) {
-        for (int n = 0; n < 4; n++) /* each takes 21 bytes of the ring, so three fit */
+        for (int n = 0; n < 4; n++) /* a packet takes 21 bytes of the ring, so three fit */
             md_tap_put(&tap, MD_ANSWERING, INT64_C(0x100000000), said, LEN);
         CHECK(tap.lost == (uint64_t)LEN * (uint64_t)(round + 1));
         for (int n = 0; n < 3; n++) {

@@ -1,5 +1,5 @@
-/* Check when the transceiver's direction changes. This test replaces the clock, the serial driver's calls and
- * write(2), and simulates the UART. */
+/* Check when the core switches an RS-485 transceiver between sending and receiving. This test replaces the
+ * clock, the serial driver's calls and write(2), and simulates the UART. */
 #define _GNU_SOURCE
 #include "checks.h"
 #include "engine.h"
@@ -24,7 +24,7 @@ static struct {
     int sending_level, takes, rings, keeps;
     int reports_end, rts_error, write_error;
     int is_usb;
-    int has_mode, is_deaf;  /* the driver has an RS-485 mode; it ignores the request to use it */
+    int has_mode, is_deaf;  /* the driver has an RS-485 mode; is_deaf: it ignores requests to use it */
     uint32_t flags;
 } uart;
 
@@ -100,7 +100,7 @@ int ioctl(int fd, int request, ...)
     case TIOCSRS485:
         return mode_of_driver((unsigned long)request, argument);
     default:
-        CHECK(request == TIOCOUTQ); /* the core makes no other ioctl */
+        CHECK(request == TIOCOUTQ); /* the core must not make any other ioctl */
         return refuse(ENOTTY);
     }
 }
@@ -130,7 +130,7 @@ static struct md_port *new_port(int mode, int is_usb)
     uart.takes = 1000;
     uart.sending_level = mode != MD_RS485_RTS_DOWN;
     uart.is_up = 1; /* open() raises RTS */
-    uart.reports_end = 1; /* of a USB driver too, but its report is older than the request */
+    uart.reports_end = 1; /* a USB driver reports the end too, but its report is outdated */
     uart.is_usb = is_usb;
     CHECK(md_rs485_begin(&port, mode, is_usb) == 0);
     return &port;
@@ -154,7 +154,7 @@ static void check_direction(void)
     static const struct {
         const char *row;
         int mode, is_usb, len;
-        int64_t start_ns, percent, most_ns; /* most_ns: limit from the last bit to the fall of RTS */
+        int64_t start_ns, percent, most_ns; /* most_ns: longest time from the last bit to the fall of RTS */
     } rows[] = {
         {"a UART", MD_RS485_RTS_UP, 0, 8, 0, 100, 0},
         {"RTS off while sending", MD_RS485_RTS_DOWN, 0, 8, 0, 100, 0},
@@ -198,7 +198,7 @@ static void check_parts(void)
     int before = uart.changes;
     for (int at = 0; at < 64;) {
         at += (int)md_rs485_write(port, frame + at, (size_t)(64 - at));
-        uart.now_ns = uart.end_ns + 5 * CHARACTER_NS; /* the next part is late: keep RTS on */
+        uart.now_ns = uart.end_ns + 5 * CHARACTER_NS; /* the rest of the frame is late: keep RTS on */
         CHECK(md_rs485_look(port, uart.now_ns) == 0 && uart.is_up);
     }
     port->turn.line.state = MD_AWAITING;

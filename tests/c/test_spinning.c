@@ -1,5 +1,5 @@
-/* At the end of a silence, the engine's thread spins if a queued request is next. If a client's request is
- * next, it sleeps. */
+/* At the end of the silence before a request, the engine's thread spins if the request is in its queue. It
+ * sleeps if the request comes from a client's thread. */
 #include "internal.h"
 
 #include <assert.h>
@@ -11,7 +11,7 @@
 
 enum {
     BY_HAND = 50, MOST_TRIES = 500,
-    FEW = 60 /* limit of clock readings per exchange without spinning, which makes about 30 per us */
+    FEW = 60 /* limit of clock readings per exchange; a spinning thread makes about 30 per us */
 };
 static const int64_t SILENCE_NS = 3000000, TIMEOUT_NS = INT64_C(5000000000);
 
@@ -68,7 +68,7 @@ static void ask_queued(struct md_port *port, const struct md_exchange *exchange)
         poll(NULL, 0, 1);
 }
 
-/* Return the number of clock readings for one exchange. */
+/* Return how often the engine reads the clock during one exchange. */
 static int looks_of(void (*ask)(struct md_port *, const struct md_exchange *), struct md_port *port,
                     const struct md_exchange *exchange)
 {

@@ -1,5 +1,6 @@
-/* A command that the driver still holds is called off in two cases: the wait for its last bit takes too long
- * (RTS is switched after it), or its port is closed. The simulated driver has RTS, and never sends. */
+/* The core discards a command that the driver has not sent yet in two cases: the wait for its last bit, after
+ * which RTS is switched, takes too long; or its port is closed. The simulated driver has RTS, and never
+ * sends. */
 #define _GNU_SOURCE
 #include <asm/ioctls.h>
 #include <sys/syscall.h>
@@ -34,7 +35,7 @@ static void *stop(void *port)
     return NULL;
 }
 
-/* Return 1 if the held request is called off. */
+/* Return 1 if the core discards the request that the driver holds. */
 static int is_called_off(struct md_engine *engine, uint8_t function, int is_closed)
 {
     static const int64_t TIMEOUT_NS = INT64_C(20000000000);

@@ -1,4 +1,4 @@
-/* The core passes the duration of a wait to the system without rounding. This program intercepts the system
+/* The core passes the duration of a wait to the system without rounding. This test intercepts the system
  * calls. */
 #define _GNU_SOURCE
 #include "internal.h"

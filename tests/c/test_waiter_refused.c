@@ -68,7 +68,7 @@ static int try_without(unsigned error)
 
 int main(void)
 {
-    wait_for_both(); /* with the calls that this system has */
+    wait_for_both(); /* first with all calls of this system */
     static const unsigned errors[] = {ENOSYS, EPERM};
     for (size_t i = 0; i < sizeof errors / sizeof *errors; i++) {
         int status;

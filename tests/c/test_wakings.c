@@ -1,4 +1,5 @@
-/* A client wakes the engine's thread only if the thread would otherwise serve the port too late. */
+/* A client (a thread that asks for an exchange) wakes the engine's thread only if this thread would otherwise
+ * serve the port too late. */
 #include "internal.h"
 
 #include <assert.h>
@@ -66,7 +67,7 @@ static int asked(struct md_port *port, const struct md_exchange *exchange, struc
 
 int main(void)
 {
-    alarm(60); /* no other call would wake the thread */
+    alarm(60); /* end the test if the thread is never woken */
     struct md_history history = {0};
     struct md_drive drive = {.least_timeout_ns = TIMEOUT_NS, .most_timeout_ns = TIMEOUT_NS,
                              .history = &history};
@@ -83,8 +84,8 @@ int main(void)
     struct md_port *port = md_port_open(engine, ends[0], -1, MD_NO_TRANSACTIONS, 4);
     assert(port);
 
-    /* A client whose next request comes during the silence need not wake the thread, which wakes at its end
-     * anyway. A client that is delayed for longer than the silence wakes the thread. */
+    /* During the silence between two requests, a client need not wake the thread, which wakes at the end of
+     * the silence anyway. A client that comes later wakes the thread. */
     struct md_completion before, found;
     asked(port, &exchange, &before);
     int unrung = 0;
@@ -98,8 +99,8 @@ int main(void)
         before = found;
     }
 
-    /* If a line has been silent for long, the thread sleeps: the client wakes it, and it sends immediately.
-     * On a busy machine the thread may still be awake. */
+    /* After a long silence the thread sleeps, and the client wakes it. On a busy machine the thread may still
+     * be awake. */
     int rung = 0;
     for (int tries = 0; rung == 0; tries++) {
         assert(tries < MOST_TRIES);

@@ -152,7 +152,7 @@ def test_a_stop_is_written_behind_held_bytes_but_a_command_is_not(ends: Ends, po
 
 
 @pytest.mark.parametrize("insists", [False, True], ids=["read", "read of a stop"])
-def test_a_stop_in_a_stall_follows_one_read_at_most(ends: Ends, port: Port, insists: bool) -> None:
+def test_a_stop_during_a_stall_is_sent_after_at_most_one_read(ends: Ends, port: Port, insists: bool) -> None:
     peer = Peer(least_timeout=TIMEOUT_S, most_timeout=TIMEOUT_S)
     assert port.carry_out(exchange(READ)).result == Failure.NO_REPLY
     for _ in range(3):

@@ -1,4 +1,6 @@
-"""The fuzzers' corpora: a line of corpus.txt is an input of a parser, with its name and its bytes in hex."""
+"""Read and write corpus.txt, the fuzzers' corpora. Each line has a parser, an input's name, and the input's
+bytes in hex.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,7 @@ def load(parser: str) -> dict[str, bytes]:
 
 
 def save(parser: str, inputs: dict[str, bytes]) -> None:
-    """Replace a parser's corpus by these inputs."""
+    """Replace the corpus of a parser by these inputs."""
     lines = CORPUS.read_text("ascii").splitlines(keepends=True)
     others = [line for line in lines if not line.startswith(f"{parser} ")]
     own = [f"{parser} {name} {data.hex()}\n" for name, data in inputs.items()]

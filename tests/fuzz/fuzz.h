@@ -1,7 +1,8 @@
-/* Shared by the C fuzz harnesses: assertions, and the position of line bytes (frames or noise) in an input.
+/* Shared by the C fuzz harnesses: assertions, and the position of frames or noise in an input.
  *
  * A harness defines LLVMFuzzerTestOneInput and find_wire. mutator.c mutates inputs and repairs the frame at
- * the position that find_wire returns: otherwise most mutants would have wrong byte counts and checksums. */
+ * the position that find_wire returns: otherwise most mutated frames would have wrong byte counts and
+ * checksums. */
 #ifndef FUZZ_H
 #define FUZZ_H
 
@@ -15,10 +16,10 @@
 #define must(truth) \
     ((truth) ? (void)0 : (fprintf(stderr, "%s:%d: not so: %s\n", __FILE__, __LINE__, #truth), abort()))
 
-/* The position of bytes in an input that the harness passes to the core as if they came on a line. */
+/* The position of bytes in an input that the harness passes to the core as bytes from a line. */
 struct wire {
     size_t at, len;
-    size_t length_at;           /* position of the byte that holds `len`; SIZE_MAX: there is none */
+    size_t length_at;           /* position of the input's byte with `len`; SIZE_MAX: none */
     int is_fixed;               /* `len` must not change */
     int framing;                /* -1: any */
     int is_reply;               /* the bytes should be a reply to `request` */
@@ -27,8 +28,8 @@ struct wire {
 
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size);
 
-/* Select line bytes in the input by `seed`; return 0 if there are none. May repair bytes around them, such
- * as lengths. */
+/* Select bytes from a line in the input, depending on `seed`; return 0 if there are none. May repair bytes
+ * around them, such as lengths. */
 int find_wire(uint8_t *data, size_t size, unsigned seed, struct wire *wire);
 
 /* Return a copy in memory of exactly this size, so that sanitizers detect over-reads. The caller frees it. */

@@ -1,4 +1,4 @@
-/* Decode hostile capture files into columns, with the reader of packets, the splitter and the decoder.
+/* Decode hostile capture files into columns: read packets, split them into frames, decode the frames.
  *
  * An input is a byte with the kind of file, link type and clock, a byte with the size of buffers, and the
  * file's packets: pcap without its header, or pcapng. */
@@ -12,7 +12,7 @@ struct reader {
     struct md_channel channels[CHANNELS];
     struct md_decoder decoders[CHANNELS];
     struct md_known known[CHANNELS][PLACES];
-    uint64_t rows, bytes; /* numbers of decoded rows, and of bytes that the splitter used */
+    uint64_t rows, bytes; /* number of decoded rows; number of bytes in frames and junk */
 };
 
 static const struct md_field fields[] = {{.at = 0, .multiplier = 1, .divisor = 1},
@@ -86,7 +86,7 @@ static void read_all(struct reader *reader)
             is_stuck &= stream->len == before;
         }
         if (is_stuck)
-            return; /* a packet exceeds the buffer, which the library makes larger than any packet */
+            return; /* here the buffer may be too small for a packet; the library's is not */
     }
     must((state == MD_UNPACKED) == (capture->at == capture->len));
     must(state == MD_UNPACKED || state == MD_CUT || state == MD_NONSENSE ||

@@ -1,4 +1,4 @@
-/* Hostile replies and field declarations for the decoder of values, and hostile codes of names.
+/* Decode values from hostile replies with hostile field declarations, and join names by hostile codes.
  *
  * An input is a header (result, room, and so on), four fields of a block, and the reply's data. */
 #include "fuzz.h"
@@ -176,7 +176,8 @@ static void check_rows(const uint8_t *head, const struct md_block *block,
     free(rows.reg), free(rows.status), free(rows.value), free(rows.valid);
 }
 
-/* Check that md_spell() joins the names of codes, and returns -1 for an unknown code or a full buffer. */
+/* Check that md_spell() joins the names that the codes stand for. It must return -1 for an unknown code or a
+ * full buffer. */
 static void check_spelling(const uint8_t *head, const uint8_t *text, size_t len)
 {
     int32_t offsets[5] = {0};
@@ -224,7 +225,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
     uint8_t *exact = exact_copy(bytes, len);
     for (int wire = -1; wire <= 256; wire++) {
         if (wire > 0 && (wire & 0x3F) > MD_BCD32 + 1)
-            continue; /* unknown formats all behave alike: one is enough */
+            continue; /* one unknown format is enough */
         for (size_t at = 0; at <= 8 * len + 1; at++)
             must(is_same(md_value(exact, len, at, wire), expected(exact, len, at, wire)));
     }
@@ -244,7 +245,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
     return 0;
 }
 
-/* An input has no frames to repair: the data of a reply have no checksum. */
+/* Return 0: an input has no frame to repair. */
 int find_wire(uint8_t *data, size_t size, unsigned seed, struct wire *wire)
 {
     (void)data, (void)size, (void)seed, (void)wire;

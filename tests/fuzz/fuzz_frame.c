@@ -15,7 +15,8 @@ static int parse_request(int framing, const uint8_t *bytes, size_t len, const st
     return md_parse_request(framing, bytes, len, out);
 }
 
-/* Parse each prefix: check that the result is MD_INCOMPLETE until it is final. Return the final result. */
+/* Parse each prefix of the bytes. Check that the result is MD_INCOMPLETE until it is final. Return the final
+ * result. */
 static int check_prefixes(parser *parse, int framing, const uint8_t *bytes, size_t len,
                           const struct md_message *request)
 {
@@ -35,8 +36,8 @@ static int check_prefixes(parser *parse, int framing, const uint8_t *bytes, size
     return decided;
 }
 
-/* If the parser accepts the request and its fields are within bounds, check that building it again gives the
- * same bytes. */
+/* If the parser accepts the request and the core can build such a request, check that it builds the same
+ * bytes. */
 static void check_request(int framing, const uint8_t *bytes, size_t len)
 {
     struct md_message found;
@@ -71,17 +72,17 @@ static void check_reply(int framing, const uint8_t *bytes, size_t len, const str
     must(found.exception || (used >= md_reply_length(framing, request) && /* equal for most functions */
                              used <= md_longest_reply(framing, request)));
     if (md_build_request(framing, request, asked, sizeof asked) < 0)
-        return; /* for requests that cannot be built, replies are not checked further */
+        return; /* the core would not send this request */
     int length = md_build_reply(framing, &found, built, sizeof built);
     must(length == used);
     if (framing == MD_DELIXI && (found.exception || found.function == 3))
-        return; /* other digits of a refusal have no meaning; a drive's state is also stored as data */
+        return; /* rebuilding may change digits without meaning */
     if (framing != MD_DELIXI && found.exception && found.function == 8)
         return; /* an exception to function 08 may have code 89H instead of 88H */
     if (framing == MD_TCP && found.exception) /* the length field of an exception reply may be wrong */
         memcpy(built + 4, bytes + 4, 2);
     must(memcmp(built, bytes, (size_t)used) == 0);
-    /* Only a request with the same address and function may accept this reply: late.c relies on that. */
+    /* late.c relies on this: a reply is accepted only for requests with its address and function. */
     if (md_parse_reply(framing, bytes, len, other, &again) > 0)
         must(request->address == other->address &&
              (framing == MD_DELIXI || request->function == other->function));
@@ -109,7 +110,7 @@ int find_wire(uint8_t *data, size_t size, unsigned seed, struct wire *wire)
     wire->len = size - HEADER;
     wire->framing = framing_of(data[0]);
     wire->is_reply = seed & 1;
-    if (seed & 2 && wire->is_reply) /* make both requests valid, with the same function */
+    if (seed & 2 && wire->is_reply) /* make both requests in the input valid, with the same function */
         for (size_t at = 0; at < HEADER; at += REQUEST_BYTES) {
             data[at] = data[0];
             data[at + 1] = data[1];

@@ -1,9 +1,9 @@
 /* Feed the state machine of a line with any bytes at any time in any order.
  *
- * An input is a header (adapter, time-outs) and steps: an exchange starts, time passes, the port takes bytes
- * or fails, noise comes, or a drive's reply comes: immediately, late, in pieces, damaged, doubled, or never.
- * The value in a reply is the number of its exchange, so a reply taken for another exchange's is detected.
- * A character takes 1 ns, so that all times are small. */
+ * An input is a header (adapter, time-outs) and steps: an exchange starts, time passes, the port takes
+ * bytes or fails, noise comes, or a drive's reply comes: immediately, late, in pieces, damaged, doubled, or
+ * never. The value in a reply is the number of its exchange, so the harness detects a reply that is accepted
+ * for another exchange. A character takes 1 ns, so that all times are small. */
 #include "fuzz.h"
 
 #include <errno.h>
@@ -13,7 +13,7 @@ enum { HEADER = 4, MOST = 4096, DRIVES = 4, HEARD = 1 << 15, ANSWERS = 16, MOST_
 
 enum step { BEGIN, PASS, WAKE, TAKE, NOISE_COMES, ANSWER_COMES, PIECE_COMES, PORT_FAILS, STEPS };
 
-/* A pending reply of a drive. */
+/* A reply that a drive will send. */
 struct answer {
     int exchange;     /* number of the exchange; 0: this entry is free */
     int64_t until_ns; /* the latest time at which the reply may come */
@@ -29,16 +29,16 @@ struct scene {
     struct md_exchange exchange;
     int is_under_way, has_asked, adapter_echoes, is_spoiled;
     int number; /* number of the exchange */
-    int64_t now, begun, ends; /* present time; start of the exchange; when it must have ended */
+    int64_t now, begun, ends; /* present time; start of the exchange; its latest end */
     int64_t last_heard, silence; /* last activity on the line, and the silence required after it */
-    /* bytes received before the exchange; in it, before and after its request was sent */
+    /* numbers of received bytes: before the exchange; in it before its request; in it after its request */
     size_t left_over, before, after;
     struct answer answers[ANSWERS];
     uint64_t exchanges[DRIVES];
-    int16_t origin[HEARD]; /* for each byte after the request: the exchange to which it replies */
+    int16_t origin[HEARD]; /* for each byte after the request: the exchange whose reply has it */
     uint8_t heard[HEARD];
     struct md_tap tap;
-    /* how often each byte value went over the line: according to the tap, and in fact */
+    /* how often each byte value was on the line: according to the tap, and in fact */
     uint32_t told[256], passed[256];
 };
 
@@ -71,7 +71,7 @@ static int is_read(const struct md_message *request)
     return request->function <= 0x04;
 }
 
-/* Check that at least one of these bytes is from the drive's reply to the present exchange. */
+/* Check that these bytes include at least one of the drive's reply to the present exchange. */
 static void check_origin(const uint8_t *raw, size_t len)
 {
     int is_own = 0;
@@ -115,7 +115,7 @@ static void check_completion(void)
         must(exchange->request.address == 0 && scene.after == 0);
     else
         must((done->result >= MD_EXPIRED || done->result == MD_MAYBE_ECHO) && done->reply.address == 0);
-    if (done->result == MD_NO_REPLY) /* `raw` has nothing but the request's echo, if any */
+    if (done->result == MD_NO_REPLY) /* `raw` may only have the request's echo */
         must(done->raw_len == 0 || done->raw_len == scene.line.tx_len);
 }
 
@@ -202,8 +202,8 @@ static void hear(const uint8_t *bytes, size_t len, int origin)
     check_line();
 }
 
-/* Return the line's next action. If the line wants to read now, report an empty port and repeat. If the
- * exchange is done, end it. */
+/* Return the line's next action. If the line wants to read now, report that the port is empty and ask for the
+ * next action again. If the exchange is done, end it. */
 static int want(void)
 {
     int wanted = MD_DONE;
@@ -220,7 +220,7 @@ static int want(void)
             end();
         return wanted;
     }
-    must(wanted == MD_DONE); /* if this fails, the line reads the empty port forever */
+    must(wanted == MD_DONE); /* otherwise the line would read the empty port forever */
     return wanted;
 }
 
@@ -245,7 +245,7 @@ static void begin(const uint8_t *bytes, uint8_t silence, uint8_t turnaround)
                                           .silence_ns = silence,
                                           .turnaround_ns = turnaround,
                                               .drive = &scene.drives[drive_of(&request)]};
-    if (scene.number % 2) { /* build the frame in advance, as planning does; otherwise the line builds it */
+    if (scene.number % 2) { /* for every second exchange, build the frame in advance, as planning does */
         uint8_t *frame = scene.exchange.frame;
         int len = md_build_request(scene.exchange.framing, &request, frame, MD_KEPT_FRAME);
         scene.exchange.frame_len = (uint8_t)(len > 0 ? len : 0);
@@ -265,7 +265,7 @@ static void begin(const uint8_t *bytes, uint8_t silence, uint8_t turnaround)
     want();
 }
 
-/* Fill the data of a reply that is too short for the number of the exchange. */
+/* Fill the data of a reply that has no room for the number of the exchange. */
 static void fill_short(struct md_message *reply)
 {
     static const uint16_t lengths[] = {[0x07] = 1, [0x0B] = 4, [0x0C] = 1, [0x11] = 1, [0x16] = 4, [0x18] = 2,
@@ -336,8 +336,8 @@ static void take(size_t most)
         want();
 }
 
-/* Receive up to `most` bytes of a pending reply, one of them damaged by `flip` unless it is 0. A reply that
- * would come after its `until_ns` is dropped. */
+/* Receive up to `most` bytes of a pending reply. Unless `flip` is 0, damage one byte by it. Drop a reply that
+ * would come after its `until_ns`. */
 static void let_answer(unsigned which, size_t most, uint8_t flip)
 {
     struct answer *answer = NULL;

@@ -73,8 +73,8 @@ static struct md_piece piece_of(const uint8_t *data, size_t size, size_t at, siz
                              .is_after_pause = data[at] >> 3 & 1};
 }
 
-/* Check that a stream from which used bytes are discarded after each piece gives the same frames as the whole
- * stream. */
+/* Split the stream twice: as a whole, and with used bytes discarded after each piece. Check that the frames
+ * are the same. */
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
 {
     if (size > MOST)
@@ -107,13 +107,13 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
              parts.stream.count <= parts.stream.len);
     }
     must(!next_frame(&whole, &expected, &whole_at));
-    must(whole.passed == total && parts.passed == total); /* all bytes were reported, junk too */
+    must(whole.passed == total && parts.passed == total); /* all bytes were reported, including junk */
     close_ear(&whole);
     close_ear(&parts);
     return 0;
 }
 
-/* Select a piece. Often declare it the reply to the piece before it, which may be a request. */
+/* Select a piece of the input. Often mark it as the reply to the piece before it, which may be a request. */
 int find_wire(uint8_t *data, size_t size, unsigned seed, struct wire *wire)
 {
     size_t len = 0, count = 0, before = 0, before_len = 0;

@@ -1,8 +1,8 @@
 /* Feed a Modbus TCP connection with any bytes in any pieces at any time.
  *
- * An input is a header (match transaction ids or not, time-outs) and steps: an exchange starts, time passes,
- * or bytes come. An accepted reply must have come on this connection. If ids are matched, it must have the
- * request's id. */
+ * An input is a header (match transaction ids or not, time-outs) and steps: an exchange starts, time
+ * passes, or bytes come. An accepted reply must have come on this connection. If transaction ids are matched,
+ * it must have the request's id. */
 #include "fuzz.h"
 
 #include <errno.h>

@@ -1,6 +1,5 @@
-"""Fuzz one of the Python readers, guided by coverage: `guided.py NAME CORPUS... [libFuzzer's options]`.
-
-Needs atheris, which is libFuzzer for Python.
+"""Fuzz a reader of readers.py, guided by coverage: `guided.py READER CORPUS... [libFuzzer's options]`. Needs
+atheris (libFuzzer for Python).
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ import multidrop.sim.faults
 import multidrop.toml_check
 from multidrop.capture import decoding
 
-PACKAGES: dict[str, tuple[types.ModuleType, ...]] = {  # modules to instrument, by reader
+PACKAGES: dict[str, tuple[types.ModuleType, ...]] = {  # reader: modules whose coverage is measured
     "plant": (multidrop.families.files,),
     "family": (multidrop.families.files,),
     "import": (multidrop.families.files, multidrop.importers),
@@ -39,7 +38,7 @@ PACKAGES: dict[str, tuple[types.ModuleType, ...]] = {  # modules to instrument, 
     "parquet": (multidrop.recording,),
     "pcap": (multidrop.capture,),
 }
-MODULES = (  # modules that several readers use: always instrumented
+MODULES = (  # modules that several readers use: always measured
     multidrop.plant.model,
     multidrop.toml_check,
     multidrop.families.registry,
@@ -62,7 +61,7 @@ def instrument(module: types.ModuleType) -> None:
 
 def main() -> None:
     name, *arguments = sys.argv[1:]
-    decoding.ROWS = 2048  # rows of a batch: few, but enough for a request of 2000
+    decoding.ROWS = 2048  # fewer rows per batch than usual, but enough for a request of 2000
     for package in PACKAGES.get(name, ()):
         for found in pkgutil.iter_modules(package.__path__, package.__name__ + "."):
             instrument(importlib.import_module(found.name))
@@ -70,7 +69,7 @@ def main() -> None:
         instrument(module)
     with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as folder:
         one = partial(read, name, folder=Path(folder))
-        again = f"{sys.executable} {__file__} {name}"  # libFuzzer's command to start itself for a merge
+        again = f"{sys.executable} {__file__} {name}"  # libFuzzer starts itself by this command for a merge
         atheris.Setup([again, *arguments], lambda data: one(data))
         atheris.Fuzz()
 

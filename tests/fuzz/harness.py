@@ -18,9 +18,9 @@ OPTIONS = ("-std=c11", "-D_DEFAULT_SOURCE", "-g", "-O1", f"-I{ROOT / 'csrc'}")
 def command(
     name: str, program: Path, companion: str, *compiler: str, core: Sequence[Path] | None = None
 ) -> list[str]:
-    """Return the command that compiles a harness, its companion (mutator.c or replay.c) and the pure core.
-
-    `core` may be the objects that `compiled` returned for the same compiler, to share them among harnesses.
+    """Return the command that compiles a harness with mutator.c or replay.c and the core's pure C files. To
+    compile the core once for several harnesses, pass the objects that `compiled` returned for the same
+    compiler as `core`.
     """
     parts = [HERE / f"fuzz_{name}.c", HERE / companion, *(_core() if core is None else core)]
     return [*compiler, *OPTIONS, *map(str, parts), "-lm", "-o", str(program)]

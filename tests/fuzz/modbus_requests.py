@@ -47,7 +47,9 @@ def read_requests(path: Path) -> None:
 
 
 def taken(stream: bytes, size: int) -> list[MbapRequest]:
-    """Return the requests in a stream that comes in pieces of `size` bytes, up to the first garbage."""
+    """Return the requests that the server finds in a stream in pieces of `size` bytes, up to the first
+    invalid bytes.
+    """
     buffer, found = bytearray(), []
     for at in range(0, len(stream), size):
         buffer += stream[at : at + size]
@@ -60,7 +62,7 @@ def taken(stream: bytes, size: int) -> list[MbapRequest]:
 
 
 def plain(stream: bytes) -> list[MbapRequest]:
-    """Return the same requests, parsed from the whole stream by an independent parser."""
+    """Return the requests in a stream, up to the first invalid bytes, by an independent parser."""
     found = []
     while len(stream) >= 8:
         transaction, protocol, length, unit, function = struct.unpack(">HHHBB", stream[:8])
@@ -73,7 +75,7 @@ def plain(stream: bytes) -> list[MbapRequest]:
 
 @cache
 def served() -> tuple[ModbusServer, FakeCommands]:
-    """Return a server whose drives have values for every second register only."""
+    """Return a server and its fake commands. Only every second register of its drives has a value."""
     hub, commands, line = FakeHub(), FakeCommands(), FakeLine()
     plant = plant_of(*(("hall", drive) for drive in UNITS.values()))
     hub.values = {

@@ -1,6 +1,6 @@
 /* The mutator of all C harnesses: mutate an input, then repair lengths, byte counts and checksums of frames.
  *
- * It repairs only the fields that a receiver checks first, so that mutated frames pass these checks.
+ * Otherwise a receiver would reject nearly all mutated frames at its first checks.
  * Sometimes it leaves one of these fields wrong, to test the handling of a frame with a single mistake. */
 #include "fuzz.h"
 
@@ -142,7 +142,7 @@ static uint8_t sum_of(const uint8_t *body, size_t len)
     return (uint8_t)sum;
 }
 
-/* The bitwise algorithm of the Modbus serial-line guide, independent of the core's. */
+/* CRC-16 by the bitwise algorithm of the Modbus serial-line guide, independent of the core. */
 static uint16_t crc_of(const uint8_t *body, size_t len)
 {
     unsigned crc = 0xFFFF;
@@ -182,7 +182,7 @@ static size_t close_frame(int framing, uint8_t *body, size_t len, uint8_t *frame
     return (size_t)(at - frame);
 }
 
-/* Replace the line bytes by the frame, if there is room; return the input's new size. */
+/* Replace the bytes at `wire` by the frame, if there is room; return the input's new size. */
 static size_t replace(uint8_t *data, size_t size, size_t most, const struct wire *wire,
                       const uint8_t *frame, size_t len)
 {

@@ -1,7 +1,6 @@
-"""Read foreign or damaged files: each is accepted, or rejected with one sentence.
-
-Other exceptions, hangs and unbounded memory are failures. Accepted content, written and read again, must stay
-the same.
+"""The readers of files that may be foreign or damaged. A reader must accept a file or reject it with one
+sentence. Other exceptions, hangs and unlimited memory are failures. Accepted content must stay the same when
+it is written and read again.
 """
 
 from __future__ import annotations
@@ -60,7 +59,7 @@ address = 3
 
 @contextmanager
 def refused(kind: type[ValueError], path: Path) -> Iterator[None]:
-    """Allow the block to raise this kind of error, and check that each of its lines names the file."""
+    """Allow this kind of error in the block, and check that each line of the error's text names the file."""
     mistakes: list[ValueError] = []
     try:
         yield
@@ -164,7 +163,9 @@ def read_samples(path: Path) -> None:
 
 
 def _pair(capture: Capture) -> None:
-    """Check that the counts of exchanges match the frames, and that every byte of junk is counted."""
+    """Pair the requests and replies of a capture. Check the counts of exchanges and frames, and that every
+    byte of junk is counted.
+    """
     pairings: list[Pairing] = []
     splitters: list[Splitter] = []
     junk = exchanges = 0
@@ -210,7 +211,7 @@ def _is_kept(found: Row, written: Row) -> bool:
     return is_near and found._replace(uncertainty_ns=0) == written._replace(uncertainty_ns=0)
 
 
-READERS: dict[str, tuple[str, Callable[[Path], None]]] = {  # suffix of the file, and function, by reader
+READERS: dict[str, tuple[str, Callable[[Path], None]]] = {  # reader: suffix of its files, function
     "plant": (".toml", read_plant),
     "family": (".toml", read_family),
     "import": (".txt", read_import),

@@ -1,5 +1,5 @@
-/* Passes a parser's corpus to its harness, without libFuzzer: `replay corpus.txt PARSER`. Each line of the
- * file is an input: its parser, its name, and its bytes in hex. */
+/* Pass all inputs of a parser's corpus to its harness, without libFuzzer: `replay corpus.txt PARSER`. Each
+ * line of the file is an input: its parser, its name, and its bytes in hex. */
 #include "fuzz.h"
 
 #include <ctype.h>

@@ -28,7 +28,7 @@ from multidrop.samples.message import RowBuffer
 EXCHANGES = [each for each in PRINTED if each.request is not None]
 RTU = [exchange for exchange in EXCHANGES if exchange.framing is Framing.RTU]
 TCP = 15  # Modbus TCP, in the framing byte of fuzz.h
-WAKE, TAKE, NOISE = 2, 3, 4  # steps of fuzz_line.c
+WAKE, TAKE, NOISE = 2, 3, 4  # steps in an input of fuzz_line.c
 TIME = 1_700_000_000
 
 
@@ -173,7 +173,9 @@ def captures() -> Iterator[bytes]:
 
 
 def requests() -> Iterator[bytes]:
-    """Yield streams of clients: reads, writes, stops, unknown functions, a broadcast, and no Modbus."""
+    """Yield streams of Modbus TCP clients: reads, writes, stops, unknown functions, a broadcast, and other
+    bytes.
+    """
     bodies = [
         *("01 03 30 00 00 02", "01 04 F0 00 00 0B", "02 01 00 00 00 04", "02 02 00 00 00 01"),
         *("01 06 20 00 13 88", "01 06 10 00 00 05", "01 06 F0 0A 00 01", "02 05 00 01 FF 00"),
@@ -190,7 +192,7 @@ def requests() -> Iterator[bytes]:
 
 
 def samples() -> Iterator[bytes]:
-    """Yield messages with samples of a fleet: compressed ones, and one of pyarrow without compression."""
+    """Yield messages with samples of a fleet: compressed, and, from pyarrow, without compression."""
     for batch in (example(), counting(3)):
         buffer = RowBuffer()
         buffer.add(batch.columns())

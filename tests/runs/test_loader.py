@@ -62,8 +62,8 @@ def test_lists_and_repetitions_become_steps_with_planned_times(tmp_path: Path) -
     assert plan.commanded == ("fan", "pump")
 
 
-STEP = '[[phase]]\nname = "a"\n[[phase.step]]\n'  # these are lines 2 to 4 of the file
-MISTAKES = {  # by text of a test file: the number of the wrong line, and a part of the error's sentence
+STEP = '[[phase]]\nname = "a"\n[[phase.step]]\n'  # lines 2 to 4 of a test file
+MISTAKES = {  # text of a test file: number of the wrong line, part of the error
     "": (0, "'phase' is missing; add [[phase]], in two brackets"),
     "abort = 3\n" + STEP + 'dwell = "1 s"': (2, "abort = 3 is not right; write [abort], a table"),
     '[abort]\nlimits = ["fan.current > 3"]\n' + STEP + 'dwell = "1 s"': (3, "has no register 'current'"),
@@ -127,7 +127,7 @@ def test_each_mistake_is_reported_in_one_sentence_that_names_its_line(
     assert sentence in first
 
 
-def test_mistakes_are_listed_by_line_and_none_follows_from_another(tmp_path: Path) -> None:
+def test_mistakes_are_listed_by_line_without_consequential_errors(tmp_path: Path) -> None:
     text = (
         'abort.silence = "soon"\n[[phase]]\nname = "a"\n[[phase.step]]\ndwel = "1 s"\n'
         'frequncy = { fan = 1 }\nrate = 1\n[[phase.step]]\nstart = ["fen"]\n[[phase.step]]\n[aborted]\n'
@@ -142,7 +142,7 @@ def test_mistakes_are_listed_by_line_and_none_follows_from_another(tmp_path: Pat
         assert part in sentence
 
 
-def test_a_plant_file_instead_of_a_test_file_is_named_with_its_command(tmp_path: Path) -> None:
+def test_error_for_a_plant_file_instead_of_a_test_file_names_the_command(tmp_path: Path) -> None:
     plant = write_test(tmp_path, "").with_name("plant.toml")
     with pytest.raises(ValueError, match=r"plant\.toml: this is a plant file; poll .* `multidrop poll .*`"):
         load_test(plant)
@@ -164,7 +164,7 @@ def test_a_missing_plant_file_is_reported_with_the_line_that_names_it(tmp_path: 
         load_test(path)
 
 
-def test_a_plant_with_the_drive_test_is_refused(tmp_path: Path) -> None:
+def test_a_plant_with_a_drive_named_test_is_refused(tmp_path: Path) -> None:
     path = write_test(tmp_path, '[[phase]]\nname = "a"\n[[phase.step]]\ndwell = "1 s"', test=CHE)
     with pytest.raises(ValueError, match=r'test.toml:1: the plant has a drive "test"'):
         load_test(path)
@@ -196,7 +196,7 @@ def test_a_plant_with_the_drive_test_is_refused(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_error_for_a_test_that_does_not_fit_its_line_says_what_would_fit(
+def test_error_for_a_test_that_is_too_fast_says_what_would_fit(
     line: str, keys: dict[str, str], sentence: str, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     plan = load_test(write_test(tmp_path_factory.mktemp("misfit"), line, fan=CHE | keys))
@@ -205,14 +205,14 @@ def test_error_for_a_test_that_does_not_fit_its_line_says_what_would_fit(
     assert "would fit with" in found
 
 
-def test_silence_is_longer_than_the_period_of_a_polled_fault_code() -> None:
+def test_default_silence_is_longer_than_the_period_of_the_fault_code() -> None:
     fan = find_model("invt-che")(1, maximum_frequency=50, name="fan")
     polled = PolledDrive(fan, ["output_frequency", Polled(fan.register("fault"), 2.0)])
     plant = Plant([PlantLine("hall", "nowhere", drives=[polled])])
     assert silence_of(RunPlan(plant, [RunStep("a", {"fan": 10.0}, dwell=9.0)])) == 6.0
 
 
-def test_each_write_of_a_step_needs_time(tmp_path: Path) -> None:
+def test_a_step_must_be_long_enough_for_all_its_writes(tmp_path: Path) -> None:
     plan = load_test(write_test(tmp_path, STEP + 'dwell = "400 ms"\nfrequency = { fan = 1 }', fan=CHE))
     assert misfits(plan) == []
     many = replace(plan.steps[0], write={"fan": dict.fromkeys(map(str, range(20)), 1)})
@@ -277,12 +277,12 @@ def row(drive: str, register: str, value: float | None, seconds: float = 1.0) ->
     )
 
 
-def test_one_row_beyond_a_limit_is_reported(watch: LimitWatch) -> None:
+def test_a_single_row_beyond_a_limit_aborts_the_run(watch: LimitWatch) -> None:
     assert watch.add([row("fan", "output_current", 30.0), row("pump", "output_current", 99.0)]) == ""
     assert watch.add([row("fan", "output_current", 30.1)]) == "fan.output_current > 30: it is 30.1 A"
 
 
-def test_a_fault_of_the_runs_drives_is_reported_by_name(watch: LimitWatch) -> None:
+def test_a_fault_aborts_only_if_the_test_uses_the_drive(watch: LimitWatch) -> None:
     assert watch.add([row("fan", "fault", 0.0), row("spare", "fault", 4.0)]) == ""
     assert watch.add([row("pump", "fault", 4.0)]).startswith("pump has a fault, ")
 
@@ -295,17 +295,17 @@ def test_a_changed_fault_record_is_a_fault_but_an_old_record_is_not(tmp_path: Pa
     assert watch.add([row("pump", "last_fault", 4.0)]).startswith("pump had a fault, ")
 
 
-def test_silence_of_a_drive_or_of_a_limited_register_is_reported(watch: LimitWatch) -> None:
+def test_missing_values_of_a_drive_or_a_limited_register_are_reported(watch: LimitWatch) -> None:
     watch.add([row("fan", "fault", 0.0, 1.9), row("pump", "fault", 0.0, 1.9)])
     assert watch.silent(2 * S) == ""
     assert watch.silent(3 * S) == "no value of fan.output_current came for 3.0 s"
     watch.add([row("fan", "output_current", 1.0, 2.9)])
     assert watch.silent(3 * S) == ""
-    watch.add([row("pump", "fault", None, 3.9)])  # a miss is not a value
+    watch.add([row("pump", "fault", None, 3.9)])  # a row without a value
     assert watch.silent(4 * S) == "no value of pump came for 2.1 s"
 
 
-def test_a_fault_code_without_values_is_silence_of_its_drive(watch: LimitWatch) -> None:
+def test_missing_values_of_a_fault_code_are_reported(watch: LimitWatch) -> None:
     for drive in ("fan", "pump"):
         watch.add([row(drive, "output_current", 1.0, 2.9), row(drive, "fault", 0.0, 2.0)])
     assert watch.silent(4 * S) == ""
@@ -314,12 +314,12 @@ def test_a_fault_code_without_values_is_silence_of_its_drive(watch: LimitWatch) 
     assert watch.silent(5 * S) == "no value of pump.fault came for 3.0 s"
 
 
-def test_a_channel_does_not_hide_the_silence_of_its_drive(watch: LimitWatch) -> None:
+def test_values_of_a_channel_do_not_hide_a_silent_drive(watch: LimitWatch) -> None:
     watch.add([row("fan", "output_current", 1.0, 3.0), row("pump", "power_of_all", 1.0, 3.0)])
     assert watch.silent(3 * S) == "no value of pump came for 3.0 s"
 
 
-def test_a_condition_needs_a_value_that_is_new_enough(watch: LimitWatch, tmp_path: Path) -> None:
+def test_a_step_condition_needs_a_value_from_after_the_steps_start(watch: LimitWatch, tmp_path: Path) -> None:
     (condition,) = (step.until for step in load_test(tmp_path / "test.toml").steps)
     assert condition
     assert not watch.holds(condition, 0)

@@ -1,4 +1,4 @@
-"""Runs on simulated lines, judged by the far ends: order and times of writes, aborts, stops."""
+"""Test runs on simulated lines. The simulated drives check order and times of writes, aborts and stops."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def never(fan: MotorDrive) -> None:
     """Change nothing during the run."""
 
 
-# for each kind of abort: lines of the test file, the event that causes it, and the reason in the result
+# for each kind of abort: limits in the test file, the event that causes the abort, the reason in the result
 ABORTS: dict[str, tuple[str, Callable[[MotorDrive], None], str]] = {
     "limit": (
         '[abort]\nlimits = ["fan.output_current > 30"]',
@@ -139,11 +139,11 @@ def test_an_abort_stops_all_drives_and_says_why(kind: str, tmp_path: Path) -> No
     path = write_test(tmp_path, text, fan=CHE, pump=CHE)
     with simulated_test(path, speed=SPEED) as (plan, sims):
         sims[1].motor.target = 20.0
-        sims[1].motor.run()  # the test run does not command this drive of the plant
+        sims[1].motor.run()  # no step commands this drive
         happened: list[bool] = []
 
         def happen(rows: object) -> None:
-            quiet = {"fault": "steps 1", "silence": "hold"}  # so that no command to the drive fails first
+            quiet = {"fault": "steps 1", "silence": "hold"}  # otherwise a command would fail first
             is_due = test.phase == quiet.get(kind, test.phase)
             if sims[0].motor.energised and is_due and not happened:
                 happened.append(True)
@@ -179,7 +179,7 @@ def test_a_step_whose_commands_contradict_each_other_is_refused(step: RunStep, s
 
 
 class FixedPoller:
-    """A poller without lines; the only row of each batch is a current of this drive."""
+    """A fake poller. Each batch has one row: the next current in `currents`."""
 
     buses: ClassVar[dict[str, Bus]] = {}
 
@@ -204,7 +204,7 @@ def session(folder: Path, limits: str, poller: Any, *takers: Any, writer: Any = 
     )
 
 
-def test_limits_are_compared_although_there_are_always_new_rows(tmp_path: Path) -> None:
+def test_the_duration_limit_is_checked_while_new_rows_keep_coming(tmp_path: Path) -> None:
     poller = FixedPoller(1.0, 1.0)
     found = session(tmp_path, 'duration = "3 s"', poller)
     found._run._begin_ns = clock.now_ns() - 4 * 10**9
@@ -233,7 +233,7 @@ class HangingWriter:
 LIMIT = 'limits = ["fan.output_current > 30"]'
 
 
-def test_limits_do_not_wait_for_a_disk_that_hangs_and_all_rows_are_written_in_order(tmp_path: Path) -> None:
+def test_limits_abort_while_the_disk_hangs_and_all_rows_are_written_later(tmp_path: Path) -> None:
     disk, poller = HangingWriter(), FixedPoller(1.0, 31.0)
     found = session(tmp_path, LIMIT, poller, writer=disk)
     found._mark("start")
@@ -247,14 +247,14 @@ def test_limits_do_not_wait_for_a_disk_that_hangs_and_all_rows_are_written_in_or
     assert disk.written == ["phase", "output_current", "phase", "output_current", "closed"]
 
 
-def test_rows_that_a_hanging_disk_loses_abort_the_run_and_are_counted(
+def test_a_run_is_aborted_if_a_hanging_disk_loses_rows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(runner, "MOST_WAITING", 2)
     monkeypatch.setattr(runner, "ENDING_S", 0.01)
     disk = HangingWriter()
     found = session(tmp_path, LIMIT, FixedPoller(*[1.0] * 4), writer=disk)
-    for _ in range(4):  # the thread has taken at most one batch from the queue
+    for _ in range(4):  # the hanging thread has taken one batch at most
         found.take()
     with pytest.raises(Exception, match=r"more than 2 batches waited for the recording run\.arrows"):
         found._look([])
@@ -298,7 +298,7 @@ def test_no_step_is_shortened_by_a_delay_of_the_run(tmp_path: Path, monkeypatch:
     ("silence", "seconds", "why"),
     [
         ("3 s", 4, "no value of fan came for 4"),
-        ("1 min", 6, "the run stood still for 6"),  # silence does not end this run: new rows come at once
+        ("1 min", 6, "the run stood still for 6"),  # new rows come at once: no silence
     ],
 )
 def test_no_step_is_carried_out_after_the_computer_has_slept(
@@ -320,7 +320,7 @@ def test_no_step_is_carried_out_after_the_computer_has_slept(
 
 
 @pytest.mark.slow
-def test_a_run_is_not_ok_if_the_stops_of_its_line_raise(
+def test_a_run_is_not_ok_if_stopping_a_line_raises_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     original = Bus.stop_all
@@ -343,7 +343,7 @@ def test_a_run_is_not_ok_if_the_stops_of_its_line_raise(
 
 
 @pytest.mark.slow
-def test_a_refused_run_stops_no_motor_and_a_test_can_run_again(tmp_path: Path) -> None:
+def test_a_refused_run_stops_no_motor_and_can_be_repeated(tmp_path: Path) -> None:
     out = tmp_path / "run.arrows"
     with simulated_test(write_test(tmp_path, '[abort]\nduration = "8 s"\n' + STEPS)) as (plan, (fan,)):
         out.touch()
@@ -373,7 +373,7 @@ def test_a_failed_command_aborts_before_any_later_step(tmp_path: Path) -> None:
 def test_a_busy_computer_aborts_only_the_run_of_a_real_drive(
     is_real: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The first three attempts of the first command are too late, as if the computer had no time for them."""
+    """The first three attempts of the first command expire, as on a busy computer."""
     command, attempts = runner._command, count()
 
     def late(drive: Drive, step: RunStep) -> None:
@@ -387,7 +387,7 @@ def test_a_busy_computer_aborts_only_the_run_of_a_real_drive(
             monkeypatch.setattr(runner, "is_simulated", lambda identity: False)
         result = TestRun(plan, speed=1.0 if is_real else SPEED).run()
     assert bool(result.abort) == is_real
-    assert next(attempts) == (1 if is_real else 6)  # the test has three steps
+    assert next(attempts) == (1 if is_real else 6)  # six: three attempts too late, and three steps
 
 
 # ---- the first stop of an abort, counted in requests at the far ends ----
@@ -402,24 +402,23 @@ name = "wait"
 {step}
 [[phase.step]]
 start = ["a", "b", "c"]
-"""  # the start is never reached, but before the first step the drives' identities are checked
+"""  # the test ends before this start, which makes the run check all drives' identities first
 
 
 class FarEnds:
-    """The far ends of a run's lines. An event gives the run a reason to abort.
-
-    After the event, the far ends' clock advances by each pause of the main thread, and an exchange takes its
-    predicted time on this clock. Once stops have begun, a reply also waits for the thread that sends the
-    line's first stop. So a busy computer changes no count.
+    """Simulated drives that count requests. An event gives the run a reason to abort. After the event,
+    replies come on a simulated clock, which advances by each pause of the main thread. An exchange takes its
+    predicted time on this clock. After the abort, a reply also waits until a thread is about to send the
+    line's first stop. So the counts do not depend on the computer's load.
     """
 
     def __init__(self, test: TestRun, monkeypatch: pytest.MonkeyPatch) -> None:
         self.test = test
         self.sims: dict[str, Any] = {}
         self.requests: dict[str, list[Message]] = {}  # by line
-        self.cause: dict[str, int] | None = None  # by line: requests before the reason for the abort
+        self.cause: dict[str, int] | None = None  # by line: requests before the abort's reason
         self.event: Callable[[FarEnds], object] | None = None  # called after two bus cycles of the first step
-        self._left: dict[str, int] = {}  # by line: requests before the event
+        self._left: dict[str, int] = {}  # by line: number of requests until the event
         self._monkeypatch = monkeypatch
         self._clock, self._ticked = 0.0, threading.Condition()
         self._due: dict[str, float] = {}  # by line: time of the newest reply
@@ -453,7 +452,7 @@ class FarEnds:
     def run(self, event: Callable[[FarEnds], object]) -> RunResult:
         self.event = event
         with ExitStack() as stack:
-            for line in self.test.plan.plant.lines:  # a thread for each, because replies wait in it
+            for line in self.test.plan.plant.lines:  # replies wait in a thread per line
                 sims = [simulated(polled.drive) for polled in line.drives]
                 for sim in sims:
                     self._watch(sim, line)
@@ -461,7 +460,7 @@ class FarEnds:
             return self.test.run()
 
     def _watch(self, sim: Any, line: PlantLine) -> None:
-        """Note this drive's requests, and delay its replies."""
+        """Record this drive's requests, and delay its replies after the event."""
         requests = self.requests.setdefault(line.name, [])
         exchange_s = predict(planned_on(line)).cycle / len(planned_on(line))
         receive, self.sims[sim.drive.name] = sim.receive, sim
@@ -473,7 +472,7 @@ class FarEnds:
                 return receive(frame)
             requests.append(frame.message)
             if is_write(frame.message):
-                sim._held.clear()  # the values of `exceed`: the motor is at rest
+                sim._held.clear()  # a write is a stop: the high value ends
             if self.event:
                 self._left[line.name] -= bool(self.test.phase)
                 if max(self._left.values()) > 0:
@@ -486,7 +485,7 @@ class FarEnds:
         vars(sim)["receive"] = noting
 
     def _is_caught_up(self) -> bool:
-        """Return True if all requests before the present time have come."""
+        """Return True if the run has sent all requests that are due on the simulated clock."""
         return self._is_stopping or min(self._due.values()) > self._clock
 
     def _await_reply(self, line: PlantLine, exchange_s: float) -> None:
@@ -498,12 +497,12 @@ class FarEnds:
             )
 
     def happen(self) -> None:
-        """Note that the reason for the abort exists from now on."""
+        """Count requests from now on: the reason for the abort exists."""
         if self.cause is None:
             self.cause = {line: len(requests) for line, requests in self.requests.items()}
 
     def show(self, drive: str, register: str) -> None:
-        """The reason is the next value of this register that is read."""
+        """Call `happen` when this register is read next."""
         sim = self.sims[drive]
         refresh = sim.refresh
 
@@ -515,18 +514,20 @@ class FarEnds:
         vars(sim)["refresh"] = noting
 
     def pass_time(self, seconds: float) -> None:
-        """Let the run's steps be later by this time."""
+        """Make the run's clock advance by this time."""
         self.test._begin_ns -= round(seconds * 1e9)
         self.happen()
 
     def silence(self, seconds: float) -> None:
-        """Let the newest values be older by this time."""
+        """Make the newest values older by this time."""
         awake = clock.boottime_ns
         self._monkeypatch.setattr(clock, "boottime_ns", lambda: awake() + round(seconds * 1e9))
         self.happen()
 
     def stops_after(self, line: str) -> int:
-        """Return how many requests of this line came after the reason, up to the first write: a stop."""
+        """Return how many requests this line got after the abort's reason, up to and including the first
+        stop.
+        """
         assert self.cause is not None
         later = self.requests[line][self.cause[line] :]
         return 1 + next(at for at, request in enumerate(later) if is_write(request))
@@ -543,7 +544,7 @@ def trip(ends: FarEnds) -> None:
 
 
 def refuse(ends: FarEnds) -> None:
-    """Refuse the setpoint of the step that comes after the first one."""
+    """Make drive b refuse the setpoint of the second step."""
     accept = ends.sims["b"].accept
 
     def refusing(cell: MemoryCell, raw: int) -> int:
@@ -556,7 +557,7 @@ def refuse(ends: FarEnds) -> None:
     ends.test._begin_ns -= 120 * 10**9  # the second step is due
 
 
-# for each kind of abort: limits, the first step, what happens, and the reason in the result
+# for each kind of abort: limits, first step, event that causes the abort, reason in the result
 CAUSES: dict[str, tuple[str, str, Callable[[FarEnds], object], str]] = {
     "limit": ('limits = ["a.output_current >= 60"]', WAIT, exceed, "a.output_current >= 60"),
     "limit on another line": (
@@ -612,7 +613,9 @@ FAMILIES = [model for model in (*MODELS, *SHIPPED) if find_model(model).stop is 
 @pytest.mark.long
 @pytest.mark.parametrize("model", FAMILIES)
 def test_the_first_stop_frame_of_an_abort_comes_within_two_bus_cycles(model: str, tmp_path: Path) -> None:
-    """Count the requests at the far end, from the read of the high value to the first write, a stop."""
+    """The simulated drives count requests from the read of the high value to the first write, which is a
+    stop.
+    """
     family = find_model(model)
     numbers = [register.name for register in family.readings() if register.values is None and register.step]
     limited = "output_current" if "output_current" in numbers else "output_frequency"
@@ -627,10 +630,10 @@ def test_the_first_stop_frame_of_an_abort_comes_within_two_bus_cycles(model: str
             c=keys,
         )
     ) as (plan, sims):
-        are_writes: list[bool] = []  # whether each request at the far end is a write
-        reads: list[int] = []  # numbers of requests that have read the high value
+        are_writes: list[bool] = []  # for each request: is it a write?
+        reads: list[int] = []  # which requests have read the high value
         for sim in sims:
-            _note(sim, are_writes, lambda: sims[0].__setitem__(limited, 0.0))  # the motor is at rest
+            _note(sim, are_writes, lambda: sims[0].__setitem__(limited, 0.0))  # the write is a stop
         refresh = sims[0].refresh
 
         def note_read(cell: MemoryCell) -> None:
@@ -650,7 +653,7 @@ def test_the_first_stop_frame_of_an_abort_comes_within_two_bus_cycles(model: str
 
 
 def _note(sim: MotorDrive, are_writes: list[bool], on_write: Callable[[], object]) -> None:
-    """Add to `are_writes`, for each request that this drive receives, whether it is a write."""
+    """For each request that this drive receives, append to `are_writes` whether it is a write."""
     receive = sim.receive
 
     def noting(frame: Frame) -> Message | None:
@@ -668,17 +671,14 @@ def _note(sim: MotorDrive, are_writes: list[bool], on_write: Callable[[], object
 SHORT = STEPS.replace('"2 s"', '"300 ms"')
 LONG = SHORT.replace("[20.0, 30.0]", str([20.0, 30.0] * 60))  # a setpoint every 300 ms, for 36 s
 FAST = CHE | {"baudrate": 38400}
-INTERRUPTED = 10  # processes of each seed
-INTERRUPTED_TURNING = 8  # those that are interrupted while their motor turns
+INTERRUPTED = 10  # number of interrupted processes per seed
+INTERRUPTED_TURNING = 8  # number of these whose motor turns
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("seed", first_in_ci(*range(10)))
 def test_no_motor_keeps_running_after_ctrl_c_at_a_random_moment(seed: int, tmp_path: Path) -> None:
-    """Each seed interrupts 10 processes in turn: 8 while the motor turns, and 2 at any moment of a short run.
-
-    The simulated drive says whether its motor turns when the signal is sent.
-    """
+    """Each seed interrupts 10 processes: 8 while the motor turns, and 2 at any moment of a short run."""
     chance = random.Random(seed)
     turned = 0
     for number in range(INTERRUPTED):
@@ -717,7 +717,7 @@ def test_no_motor_keeps_running_after_a_port_was_lost(seed: int, tmp_path: Path)
     def lose() -> None:
         until(
             lambda: sims[0].motor.energised or has_ended.is_set()
-        )  # on a busy machine, the run may abort before the start
+        )  # on a busy machine, the run may be aborted before the start
         time.sleep(chance.uniform(0.0, 1.0))
         first.__exit__(None, None, None)
         time.sleep(chance.uniform(0.2, 2.0))
@@ -738,7 +738,7 @@ def test_no_motor_keeps_running_after_a_port_was_lost(seed: int, tmp_path: Path)
 def test_a_simulation_speed_does_not_shorten_the_waits_of_other_threads(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Another thread may ramp a real motor."""
+    """Another thread of the process may ramp a real motor at the same time."""
     waits: list[float] = []
     monkeypatch.setattr(clock, "time", SimpleNamespace(**vars(time) | {"sleep": waits.append}))
     with clock.at_speed(10.0):

@@ -1,4 +1,4 @@
-"""multidrop with the Linux drivers of USB serial adapters and of a 16550A, in a guest."""
+"""multidrop with the Linux drivers of USB serial adapters and of a 16550A, in a virtual machine."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ SETTINGS = [(1200, "8N1"), (9600, "8E1"), (19200, "8O1"), (57600, "8E2"), (11520
 
 
 def is_near(baudrate: int, wanted: int) -> bool:
-    """Return True if receivers tolerate the difference: 2 %."""
+    """Return True if the baud rates differ by at most 2 %, which receivers tolerate."""
     return abs(baudrate - wanted) <= wanted / 50
 
 
 @pytest.mark.slow
 @USB
-def test_settings_are_those_of_the_drive_at_both_ends(guest: Guest, kind: str) -> None:
+def test_kernel_and_adapter_have_the_drives_port_settings(guest: Guest, kind: str) -> None:
     facts = guest.run("settings", kind=kind, wanted=SETTINGS)
     for (baudrate, form), fact in zip(SETTINGS, facts, strict=True):
         assert fact["read"] == RIGHT
@@ -32,7 +32,7 @@ def test_settings_are_those_of_the_drive_at_both_ends(guest: Guest, kind: str) -
 
 
 @pytest.mark.slow
-def test_a_speed_that_the_adapter_does_not_have_is_refused(guest: Guest) -> None:
+def test_a_baud_rate_that_the_adapter_does_not_have_is_refused(guest: Guest) -> None:
     (fact,) = guest.run("settings", kind="cp210x", wanted=[(12345, "8E1")])
     assert "does not take the baud rate" in fact["read"]
 
@@ -81,7 +81,7 @@ def test_scan_and_doctor_name_an_adapter_by_its_serial_number(guest: Guest) -> N
 
 
 @pytest.mark.slow
-def test_a_port_that_cannot_be_opened_gives_the_reason(guest: Guest) -> None:
+def test_error_for_a_port_that_cannot_be_opened_gives_the_reason(guest: Guest) -> None:
     found = guest.run("refused_ports") | guest.run("absent_uart")
     for name, reason in {
         "locked": "in use by another program",
@@ -112,7 +112,7 @@ def test_a_16550_has_the_settings_of_the_drive(guest: Guest) -> None:
 
 
 @pytest.mark.slow
-def test_a_16550_switches_rts_and_has_no_mode_of_its_own(guest: Guest) -> None:
+def test_a_16550_switches_rts_and_its_driver_has_no_rs485_mode(guest: Guest) -> None:
     found = guest.run("uart_modes")
     assert found["rts-up"] == found["rts-down"] == RIGHT
     assert "the driver has no RS-485 mode" in found["kernel"]
@@ -120,7 +120,7 @@ def test_a_16550_switches_rts_and_has_no_mode_of_its_own(guest: Guest) -> None:
 
 @pytest.mark.slow
 @pytest.mark.long
-def test_a_16550_refuses_a_speed_without_a_divisor(guest: Guest) -> None:
+def test_a_16550_refuses_a_baud_rate_without_a_divisor(guest: Guest) -> None:
     for fact, true in zip(
         guest.run("uart", wanted=[(76800, "8N1"), (12345, "8N1")]), (57600, 12800), strict=True
     ):
@@ -133,9 +133,9 @@ def test_a_16550_refuses_a_speed_without_a_divisor(guest: Guest) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", ["rts-up", "rts-down"])
 @USB
-def test_rts_lets_the_transceiver_send_at_each_request(guest: Guest, kind: str, mode: str) -> None:
+def test_rts_switches_the_transceiver_to_sending_for_each_request(guest: Guest, kind: str, mode: str) -> None:
     found = guest.run("rts", kind=kind, mode=mode, baudrate=9600, count=5)
-    assert found["sent"] > 0  # not always five: a busy computer repeats requests, or loses the port
+    assert found["sent"] > 0  # not always five: a busy computer repeats requests or loses the port
     assert found["missing"] == 0
 
 
@@ -156,7 +156,7 @@ def test_rts_never_changes_before_the_last_bit_has_left(
 @pytest.mark.long
 @USB
 def test_rts_is_lowered_although_the_adapter_accepts_no_bytes(guest: Guest, kind: str) -> None:
-    """The transceiver must not occupy the line. Closing the port then discards the request."""
+    """Otherwise the transceiver would block the line. Closing the port then discards the request."""
     found = guest.run("rts_in_stall", kind=kind)
     assert any("stalled: its adapter takes no bytes" in result for result in found["results"])
     held, after = found["held"], found["after"]
@@ -168,7 +168,7 @@ def test_rts_is_lowered_although_the_adapter_accepts_no_bytes(guest: Guest, kind
 @pytest.mark.slow
 @pytest.mark.long
 def test_the_rs485_mode_of_a_driver_raises_rts_for_each_request(guest: Guest) -> None:
-    """The UART's registers show RTS at each byte that is sent, and the fall of RTS between requests."""
+    """The UART's registers show that RTS is up at each sent byte, and falls between requests."""
     found = guest.run("rs485_mode")
     if found is None:
         pytest.skip("tools/kernel/build found no linux-headers-amd64")
@@ -177,7 +177,7 @@ def test_the_rs485_mode_of_a_driver_raises_rts_for_each_request(guest: Guest) ->
     registers = "\n".join(found["registers"])
     written = re.findall(r"serial_write write addr 0x0([0-7]) val 0x([0-9a-f]+)", registers)
     line_control = modem_control = 0
-    levels = ""  # S: a byte was sent with RTS; s: without; -: RTS fell
+    levels = ""  # S: byte sent while RTS is up; s: byte sent while RTS is down; -: RTS fell
     for register, text in written:
         value = int(text, 16)
         if register == "3":
@@ -228,8 +228,8 @@ SIGNALS = [
 @pytest.mark.slow
 @pytest.mark.long
 @USB
-def test_a_start_that_a_stalled_adapter_holds_is_discarded(guest: Guest, kind: str) -> None:
-    """The driver would wait for ever. `close` waits once, for less than a second."""
+def test_closing_a_stalled_port_discards_the_start_that_it_holds(guest: Guest, kind: str) -> None:
+    """This driver would wait for the stalled adapter for ever. `close` waits once, for less than a second."""
     found = guest.run("start_in_stall", kind=kind)
     assert len(found["waits"]) <= 1
     assert sum(found["waits"]) < 1
@@ -240,7 +240,7 @@ def test_a_start_that_a_stalled_adapter_holds_is_discarded(guest: Guest, kind: s
 @pytest.mark.long
 @pytest.mark.parametrize(("kind", "number"), SIGNALS)
 def test_a_signal_ends_a_poll_although_its_adapter_is_stalled(guest: Guest, kind: str, number: int) -> None:
-    """The driver would wait for ever. The poll says what it waits for, and waits once."""
+    """This driver would wait for the stalled adapter for ever. The poll waits once, and reports the wait."""
     found = guest.run("end_of_stalled_poll", kind=kind, signals=[number])
     assert found["status"] == 0
     assert found["output"].count("waiting 0.75 s for its adapter") <= 1
@@ -250,7 +250,7 @@ def test_a_signal_ends_a_poll_although_its_adapter_is_stalled(guest: Guest, kind
 @pytest.mark.slow
 @pytest.mark.long
 @USB
-def test_a_stop_in_a_stall_follows_one_read_at_most(guest: Guest, kind: str) -> None:
+def test_a_stop_during_a_stall_is_sent_after_at_most_one_read(guest: Guest, kind: str) -> None:
     found = guest.run("stop_in_stall", kind=kind, seconds=6.0)
     places = [at for at, frame in enumerate(found["frames"]) if frame.startswith(STOP)]
     assert places[0] <= 1
@@ -265,7 +265,7 @@ def test_a_stop_in_a_stall_follows_one_read_at_most(guest: Guest, kind: str) -> 
 @pytest.mark.long
 @pytest.mark.parametrize("names", ["tty", "by-id"])
 def test_a_poll_continues_after_the_computer_has_slept(built: Path, names: str) -> None:
-    """The adapter gets another tty name, because its old name is still in use when it comes back."""
+    """After the sleep the adapter has another tty name, because the poll still holds the old one open."""
     with boot(built) as guest:
         found = guest.run("sleep_in_poll", names=names)
     assert found["slept"] > 1

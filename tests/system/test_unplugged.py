@@ -16,7 +16,7 @@ USB = pytest.mark.parametrize("kind", KINDS)
 
 
 def check_recovered(found: dict[str, Any]) -> None:
-    """Check that each line lost its port and is polled again, without a wrong value."""
+    """Check that each line lost its port and was polled again later, without a wrong value."""
     assert found["status"] == 0
     assert found["wrong"] == []
     for line, statuses in found["statuses"].items():
@@ -38,7 +38,7 @@ def test_unplugged_adapters_are_polled_again_when_they_are_back(guest: Guest, ki
 
 
 @pytest.mark.long
-def test_a_stop_is_sent_once_the_adapter_is_back_and_a_start_is_not(guest: Guest) -> None:
+def test_only_the_stop_is_sent_when_an_unplugged_adapter_is_back(guest: Guest) -> None:
     found = guest.run("commands_while_unplugged", kind="ftdi")
     assert found["ended"]["start"].startswith("PortLost")
     assert found["ended"]["set_frequency"].startswith("PortLost")
@@ -55,7 +55,7 @@ def test_adapters_that_exchange_their_tty_names_are_distinguished(guest: Guest, 
     found = guest.run("changed_names", how=names)
     assert found["names after"] == found["names"][::-1]
     assert found["wrong"] == []
-    if names != "by_path":  # by_path names the USB socket, which now has the other adapter
+    if names != "by_path":  # with by_path, requests go to the USB socket, which now has the other adapter
         assert found["requests to the other"] == [0, 0]
     assert found["came back"] == (names != "path")  # a port named by its device path stays lost
 
@@ -66,7 +66,9 @@ def test_adapters_that_exchange_their_tty_names_are_distinguished(guest: Guest, 
 @pytest.mark.parametrize(
     ("format", "kinds"), [("8E1", ["parity", "framing", "break"]), ("8N1", ["framing", "break"])]
 )
-def test_a_reply_with_an_error_bit_is_a_bad_reply(guest: Guest, format: str, kinds: list[str]) -> None:
+def test_a_reply_with_an_error_flag_from_the_driver_is_a_bad_reply(
+    guest: Guest, format: str, kinds: list[str]
+) -> None:
     found = guest.run("damaged_replies", format=format, kinds=kinds)
     for kind in kinds:
         assert found[kind].startswith("BadReply"), kind
@@ -89,14 +91,14 @@ def test_a_poll_counts_every_damaged_reply(guest: Guest) -> None:
 
 
 @pytest.mark.long
-def test_an_adapter_in_another_usb_socket_is_the_same_adapter(guest: Guest) -> None:
+def test_an_adapter_moved_to_another_usb_socket_is_polled_again(guest: Guest) -> None:
     found = guest.run("other_socket", is_anonymous=False, names="by_id")
     check_recovered(found)
     assert found["elsewhere"]
 
 
 @pytest.mark.long
-def test_an_adapter_without_serial_number_is_known_by_its_usb_socket(guest: Guest) -> None:
+def test_an_adapter_without_serial_number_is_identified_by_its_usb_socket(guest: Guest) -> None:
     found = guest.run("other_socket", is_anonymous=True, names="by_path")
     check_recovered(found)
     assert not found["elsewhere"]
@@ -109,7 +111,7 @@ def test_an_adapter_without_serial_number_is_known_by_its_usb_socket(guest: Gues
 @pytest.mark.parametrize("names", ["path", "by_id"])
 @USB
 def test_a_reset_adapter_is_polled_again(guest: Guest, kind: str, names: str) -> None:
-    """The port may work again before the next request, so there is not always a row about its loss."""
+    """If the port works again before the next request, no row has the status "port lost"."""
     found = guest.run("reset_in_poll", kind=kind, names=names)
     assert found["status"] == 0
     assert found["wrong"] == []

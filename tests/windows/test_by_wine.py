@@ -27,7 +27,7 @@ from multidrop.recording import open_recording
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 
 PATIENCE_S = 300.0  # a busy machine needs a minute to start Python in Wine
-SIZE = 50, 400  # rows and columns: no sentence wraps
+SIZE = 50, 400  # rows and columns: wide enough that no sentence wraps
 NOWHERE = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
 ESCAPES = re.compile(r"\x1b(\[[0-9;?]*[A-Za-z]|\][^\x07]*\x07)")
 
@@ -44,7 +44,7 @@ class Console:
             os.execvpe("wine", ["wine", str(folder / "python" / "python.exe"), *words], environment)
 
     def _hear(self) -> None:
-        """Read the output: a program whose terminal is full would block."""
+        """Read the output continuously, because a program whose terminal is full would block."""
         while select.select([self._terminal], [], [], 0.01)[0]:
             try:
                 self._heard += os.read(self._terminal, 4096)
@@ -119,18 +119,20 @@ class Wine:
         port.symlink_to(terminal)
 
     def begin(self) -> None:
-        """Start Wine's services without pipes, because services inherit them and keep them open."""
+        """Start Wine's services without pipes, because the services would inherit pipes and keep them
+        open.
+        """
         line = ["wine", str(self.folder / "python" / "python.exe"), "-c", ""]
         subprocess.run(line, env=self.environment, check=True, timeout=PATIENCE_S, **NOWHERE)
 
     def run(self, *words: object) -> subprocess.CompletedProcess[bytes]:
-        """Run Python to its end, with pipes."""
+        """Run Windows Python with these arguments to its end, with pipes for input and output."""
         line = ["wine", str(self.folder / "python" / "python.exe"), *map(str, words)]
         pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
         return subprocess.run(line, env=self.environment, check=False, timeout=PATIENCE_S, **pipes)
 
     def type_line(self, line: str, folder: Path) -> int:
-        """Type this after Python's name in the Windows shell; return the exit status."""
+        """Run Windows Python with these arguments by the Windows shell; return the exit status."""
         typed = folder / "typed.bat"
         program = f"Z:{self.folder}/python/python.exe".replace("/", "\\")
         typed.write_text(f"@{program} {line}\r\n", "ascii")
@@ -142,7 +144,7 @@ class Wine:
 
     @contextmanager
     def console(self, *words: object) -> Iterator[Console]:
-        """Start Python on a console."""
+        """Start Windows Python on a console."""
         console = Console(self.folder, list(map(str, words)), self.environment)
         try:
             yield console
@@ -159,7 +161,7 @@ pytestmark = [
 
 @pytest.fixture(scope="module")
 def wine() -> Iterator[Wine]:
-    """Yield a Wine folder. Its server is in another session, so it survives vanishing terminals."""
+    """Yield a Wine folder. Wine's server is in another session, so it survives when a terminal is removed."""
     found = Wine(Path(FOLDER))
     subprocess.run(["wineserver", "-w"], env=found.environment, check=True)
     with BoundProcess(["wineserver", "-f", "-p"], env=found.environment) as server:
@@ -224,7 +226,7 @@ print(_engine.is_realtime)
 
 
 def test_a_poll_gets_realtime_scheduling_and_returns_it(wine: Wine, pump: MotorDrive, plant: Path) -> None:
-    """Wine grants it, so this test shows only that the calls work, not how they change times."""
+    """Wine grants realtime scheduling without any effect, so this test shows only that the calls work."""
     ran = wine.run("-c", REALTIME, plant)
     assert ran.stdout.split() == [b"True", b"10", b"False"], ran.stderr
     assert b"realtime" not in ran.stderr
@@ -269,7 +271,7 @@ def test_ctrl_c_does_not_interrupt_a_stop(wine: Wine, pump: MotorDrive) -> None:
     assert not pump.motor.energised
 
 
-# A start waits up to 300 s for the motor to turn, so that Ctrl-C arrives during the wait.
+# This script's start waits up to 300 s for the motor to turn, so that Ctrl-C comes during the wait.
 START = """
 import sys
 import multidrop.cli
@@ -282,7 +284,7 @@ sys.exit(multidrop.cli.main(sys.argv[1:]))
 def test_ctrl_c_during_a_start_reports_sent_frames_and_the_stop_command(
     wine: Wine, pump: MotorDrive, tmp_path: Path
 ) -> None:
-    """Type the printed stop command; it stops the motor."""
+    """The test types the printed stop command, which stops the motor."""
     vars(pump.motor)["run"] = lambda direction=None: None
     received = ReceivedRequests(pump)
     plant = tmp_path / "hall 2.toml"
@@ -324,7 +326,7 @@ def test_invalid_port_prints_one_sentence(wine: Wine, name: str, reason: str) ->
     assert reason in sentence
 
 
-def test_pipe_escapes_letters_outside_its_encoding(wine: Wine, plant: Path) -> None:
+def test_output_to_a_pipe_escapes_letters_outside_its_encoding(wine: Wine, plant: Path) -> None:
     ran = wine.run("-m", "multidrop", "plan", plant)
     assert ran.returncode == 0, ran.stderr
     assert rb"\u043d\u0430\u0441\u043e\u0441" in ran.stdout
@@ -341,7 +343,7 @@ def test_console_prints_all_letters(wine: Wine, plant: Path) -> None:
 
 @pytest.mark.parametrize("form", ["8E1", "8O1", "8N2"])
 def test_a_port_is_set_to_parity_and_stop_bits(wine: Wine, pump: MotorDrive, form: str) -> None:
-    """Check only that the port accepts both settings: a pseudo-terminal has no wire that shows them."""
+    """Check only that the port accepts both settings, because a pseudo-terminal does not use them."""
     ran = wine.run("-m", "multidrop", "state", "COM5", "invt-che", 1, "--format", form)
     assert ran.returncode == 0, ran.stderr
 
@@ -386,7 +388,7 @@ def test_recording_of_a_killed_poll_is_readable(wine: Wine, pump: MotorDrive, pl
 # ---- ports that vanish ----
 
 
-def test_port_that_vanishes_is_polled_again_when_it_comes_back(wine: Wine, plant: Path) -> None:
+def test_a_port_that_vanished_is_polled_again_when_it_comes_back(wine: Wine, plant: Path) -> None:
     out = plant.with_name("rows.arrows")
     with ExitStack() as stack:
         cable = stack.enter_context(ExitStack())
@@ -414,7 +416,7 @@ def on_com5(wine: Wine) -> Iterator[MotorDrive]:
 
 
 def said_by(console: Console) -> list[str]:
-    """Return the program's own output, by sentence."""
+    """Return the messages in the output that start with `multidrop:`."""
     return re.findall(r"multidrop: .*\S", console.said)
 
 

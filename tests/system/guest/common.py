@@ -1,4 +1,4 @@
-"""Shared by the scenarios: a device, plants, commands and the rows of a recording."""
+"""Shared by the scenarios: a device, plant files, commands of multidrop, and the rows of a recording."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ TCGETS2 = 0x802C542A
 
 
 class Meter(Drive):
-    """A device of tools/kernel/far_end.py."""
+    """The device that tools/kernel/far_end.py simulates."""
 
     title = "meter"
     response_delay = 0.002
@@ -50,7 +50,7 @@ class Meter(Drive):
 
 
 def right(address: int, register: int) -> int:
-    """Return the value of a meter's register."""
+    """Return the correct value of a meter's register."""
     return (address << 8 ^ register) & 0xFFFF
 
 
@@ -63,7 +63,7 @@ def attempt(call: Callable[..., object], *arguments: Any, **options: Any) -> Any
 
 
 def until_answered(call: Callable[..., object], *arguments: Any) -> Any:
-    """Return what attempt() returns; repeat the call while a driver gives up its adapter.
+    """Return what attempt() returns. Repeat the call if a driver has lost its adapter.
 
     pl2303 gives its adapter 100 ms to answer a USB request. An emulated adapter on a busy computer may need
     longer.
@@ -76,10 +76,8 @@ def until_answered(call: Callable[..., object], *arguments: Any) -> Any:
 
 
 def insist(call: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
-    """Repeat a call until it succeeds, and return its result.
-
-    On a busy computer a write may expire before it is sent, and a reply may come too late. Raises the call's
-    last error if none of its attempts succeeds.
+    """Repeat a call until it succeeds, and return its result. On a busy computer a write may expire, and a
+    reply may come too late. Raises the last error after ATTEMPTS failures.
     """
     for _ in range(ATTEMPTS - 1):
         result = attempt(call, *arguments, **options)
@@ -105,9 +103,8 @@ def kernel_settings(path: str) -> tuple[int, str]:
 
 
 class Command:
-    """A command of multidrop in a process that is forked, because an interpreter takes seconds to start here.
-
-    It runs under the user id and group id `user`; `groups` are additional groups.
+    """A command of multidrop in a forked process, because an interpreter takes seconds to start in the guest.
+    The process has the user id and group id `user`, and the additional groups `groups`.
     """
 
     def __init__(self, *words: str, user: int = 0, groups: Sequence[int] = ()) -> None:
@@ -143,7 +140,7 @@ class Command:
         os.kill(self.process, number)
 
     def outcome(self) -> tuple[int, str]:
-        """Wait for the end; return the exit status and the output."""
+        """Wait for the end of the process; return its exit status and output."""
         plug.wait_until(self.is_over)
         return os.waitstatus_to_exitcode(os.waitpid(self.process, 0)[1]), self.said
 
@@ -177,13 +174,15 @@ def write_plant(lines: dict[str, tuple[str, Iterable[int]]], more: str = "", eve
 
 
 class Poll:
-    """`multidrop poll` in a process; each value of the plant's drives identifies its register and drive."""
+    """`multidrop poll` in a process. Each register of each drive has a different value, so that wrong values
+    are detected.
+    """
 
     def __init__(self, lines: dict[str, tuple[str, Iterable[int]]]) -> None:
         self.out = Path(f"/tmp/poll-{time.monotonic_ns()}.csv")
         self.command = Command("poll", write_plant(lines), "--out", str(self.out))
         self._rows: list[dict[str, str]] = []
-        self._read = 0  # bytes of the file that are in `_rows`
+        self._read = 0  # number of the file's bytes that are already in `_rows`
 
     def rows(self) -> list[dict[str, str]]:
         """Return the rows so far. Reads only the new ones, because the guest is slow."""
@@ -200,7 +199,9 @@ class Poll:
     def wait_for(
         self, status: str, lines: Iterable[str], after: int = 0, patience: float = plug.PATIENCE_S
     ) -> int:
-        """Wait until each line has a row with this status after the first `after` rows; return the count."""
+        """Wait until each line has a row with this status, not counting the first `after` rows. Return the
+        number of rows.
+        """
         wanted = set(lines)
 
         def is_there() -> bool:
@@ -215,7 +216,7 @@ class Poll:
     def end(self) -> dict[str, Any]:
         """End the poll by Ctrl-C; return its exit status and output, and a summary of its rows.
 
-        `statuses` has the statuses of each line in their order, `wrong` the values that are not the drive's.
+        `statuses` has the statuses of each line in their order. `wrong` has the rows with a wrong value.
         """
         begun = time.monotonic()
         self.command.signal(signal.SIGINT)
@@ -233,7 +234,7 @@ class Poll:
 
 
 def is_right(row: dict[str, str]) -> bool:
-    """Return True if the value is that of its drive and register."""
+    """Return True if the row's value is the correct one for its drive and register."""
     drive = find_model(MODEL)(int(row["drive"].rpartition("-")[2]))
     return abs(float(row["value"]) - proof(drive, drive.registers[row["register"]])) < 1e-9
 

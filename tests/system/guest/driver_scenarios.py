@@ -1,4 +1,6 @@
-"""Scenarios for every driver: settings, RTS, failed transfers, doctor's findings, other users of a port."""
+"""Scenarios for every driver: port settings, RTS, failed transfers, `multidrop doctor`, other users of a
+port.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,9 @@ def _values(path: str, baudrate: int, format: str, **options: Any) -> list[float
 
 
 def settings(kind: str, wanted: list[tuple[int, str]]) -> list[dict[str, Any]]:
-    """Read two values at each setting; return them, and the settings of kernel and adapter."""
+    """Read two values at each port setting. Return the values, and the settings according to kernel and
+    adapter.
+    """
     adapter = plug.Adapter(kind, f"set-{kind}")
     facts = []
     for baudrate, format in wanted:
@@ -62,7 +66,7 @@ def settings(kind: str, wanted: list[tuple[int, str]]) -> list[dict[str, Any]]:
 
 
 def rts(kind: str, mode: str, baudrate: int, count: int) -> dict[str, Any]:
-    """Read with RTS that switches a transceiver; return the adapter's record of RTS."""
+    """Read while RTS switches a transceiver. Return the adapter's record of RTS changes."""
     adapter = plug.Adapter(kind, f"rts-{kind}", sends_with=int(mode == "rts-up"))
     with Bus(adapter.path, baudrate=baudrate, format="8N1", rs485=mode) as bus:
         meter = bus.attach(Meter, address=2)
@@ -80,7 +84,9 @@ def rts(kind: str, mode: str, baudrate: int, count: int) -> dict[str, Any]:
 
 
 def rts_price(kind: str, baudrates: list[int], seconds: float, rounds: int) -> dict[int, dict[str, float]]:
-    """Read with and without RTS that switches a transceiver, in turn; return the median reads per second."""
+    """Read in turn with and without RTS that switches a transceiver. Return the median numbers of reads per
+    second.
+    """
     adapter = plug.Adapter(kind, f"price-{kind}", sends_with=1)
     rates: dict[int, dict[str, list[float]]] = {
         baudrate: {mode: [] for mode in ("off", "rts-up", "rts-down")} for baudrate in baudrates
@@ -101,7 +107,9 @@ def rts_price(kind: str, baudrates: list[int], seconds: float, rounds: int) -> d
 
 
 def rts_in_stall(kind: str) -> dict[str, Any]:
-    """Read while the adapter takes no bytes; return its record of RTS during the stall, and after it."""
+    """Read while the adapter accepts no bytes (a stall). Return its record of RTS during and after the
+    stall.
+    """
     adapter = plug.Adapter(kind, f"still-{kind}", sends_with=1)
 
     def record() -> dict[str, Any]:
@@ -134,7 +142,7 @@ def broken_transfers(kind: str) -> Counter[str]:
 
 
 def doctor() -> dict[str, dict[str, list[str]]]:
-    """Return the findings of `doctor` about each adapter and about QEMU's UART, by topic."""
+    """Return the findings of `multidrop doctor` about each adapter and about QEMU's UART, by topic."""
     plug.do("connect", {"serial": "uart"})
     paths = {kind: plug.Adapter(kind, f"doctor-{kind}").path for kind in KINDS} | {"8250": "/dev/ttyS1"}
     commands = {kind: Command("doctor", path, "--json") for kind, path in paths.items()}
@@ -148,7 +156,9 @@ def doctor() -> dict[str, dict[str, list[str]]]:
 
 
 def lasting_names() -> dict[str, Any]:
-    """Return an adapter's link in by-id, and what `scan --out` and `doctor` make of its device path."""
+    """Return an adapter's link in /dev/serial/by-id, and what `scan --out` and `multidrop doctor` write about
+    its device path.
+    """
     adapter = plug.Adapter("ftdi", "scanned", family=FAMILY, addresses=[1])
     out = Path("/tmp/scanned.toml")
     out.unlink(missing_ok=True)
@@ -194,14 +204,16 @@ def uart(wanted: list[tuple[int, str]]) -> list[dict[str, Any]]:
 
 
 def uart_modes() -> dict[str, Any]:
-    """Read two values from QEMU's UART with each way to switch a transceiver."""
+    """Read two values from QEMU's UART with each option for switching a transceiver."""
     plug.do("connect", {"serial": "uart"})
     modes = ("rts-up", "rts-down", "kernel")
     return {mode: attempt(_values, "/dev/ttyS1", 9600, "8N1", rs485=mode) for mode in modes}
 
 
 def rs485_mode() -> dict[str, Any] | None:
-    """Read with the driver's RS-485 mode; return the written registers; None if its module is missing."""
+    """Read with the driver's RS-485 mode. Return the UART registers that it wrote, or None if the kernel
+    module is missing.
+    """
     if subprocess.run(["modprobe", "rs485_uart"], check=False).returncode:
         return None
     plug.do("connect", {"serial": "uart"})

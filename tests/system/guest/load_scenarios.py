@@ -1,7 +1,7 @@
-"""A measurement beside busy processes: how regularly a line is polled, with and without realtime.
+"""Measure how regularly a line is polled beside busy processes, with and without realtime scheduling.
 
-Linux's serial drivers pass received bytes to a work of the kernel, flush_to_ldisc. The kernel's own trace
-shows how late that work starts.
+Linux's serial drivers pass received bytes on in a kernel work item, flush_to_ldisc. The kernel's trace shows
+how late it starts.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from common import FAMILY, write_plant
 from multidrop import Poller
 
 WARM_UP_S = 1.0
-# Kernel threads between a port and its program: of works, softirqs and USB/IP.
+# Kernel threads that pass bytes from a port to a program: work items, softirqs and USB/IP.
 PASSING_ON = re.compile(r"kworker/|ksoftirqd/|vhci_[rt]x")
-PRIORITY = 2  # above the core's thread, as a kernel with threaded interrupts would have it
+PRIORITY = 2  # higher than that of the core's thread, as in kernels with threaded interrupts
 TRACING = Path("/sys/kernel/tracing")
 EVENTS = ("workqueue_queue_work", "workqueue_execute_start")
 QUEUED = re.compile(r" (\d+\.\d+): workqueue_queue_work: work struct=(\w+) function=flush_to_ldisc ")
@@ -50,7 +50,7 @@ def _busy_processes(count: int) -> Iterator[None]:
 
 
 def _schedule_kernel(policy: int, priority: int) -> int:
-    """Set how the kernel's threads of PASSING_ON are scheduled; return their number."""
+    """Set the scheduling of the kernel threads in PASSING_ON; return their number."""
     count = 0
     for comm in Path("/proc").glob("[0-9]*/comm"):
         with suppress(OSError):  # the thread has ended
@@ -74,7 +74,7 @@ def _kernel_first(is_wanted: bool) -> Iterator[None]:
 
 @contextmanager
 def _traced_works() -> Iterator[list[float]]:
-    """Yield a list that at the end holds how late each flush_to_ldisc started, in ms."""
+    """Yield a list. After the block, it has the delay of each start of flush_to_ldisc, in ms."""
     late: list[float] = []
     if not (TRACING / "trace").exists():
         subprocess.run(["mount", "-t", "tracefs", "tracefs", TRACING], check=True)
@@ -101,7 +101,9 @@ def _spread(times: Sequence[float]) -> dict[str, float]:
 
 
 def _polled(plant: str, seconds: float, *, realtime: bool) -> dict[str, Any]:
-    """Poll for `seconds`; return the rate, the times between requests, and how late works start, in ms."""
+    """Poll for `seconds` s. Return the rate, the times between requests, and the delays of flush_to_ldisc, in
+    ms.
+    """
     sent: set[int] = set()
     with Poller(plant, realtime=realtime) as poller, _traced_works() as late:
         begun = time.monotonic_ns() + round(WARM_UP_S * 1e9)
@@ -115,10 +117,9 @@ def _polled(plant: str, seconds: float, *, realtime: bool) -> dict[str, Any]:
 
 
 def cadence(kind: str, loops: int, seconds: float, rounds: int) -> dict[str, list[dict[str, Any]]]:
-    """Poll two drives in turn: alone, then beside `loops` busy processes, without and with realtime.
-
-    In the last case, the kernel's threads that pass bytes on have realtime scheduling too. `kind` is that of
-    a USB adapter, or "8250" for QEMU's UART.
+    """Poll two drives: first alone, then beside `loops` busy processes, without and with realtime scheduling.
+    Last, the kernel threads that pass bytes on have realtime scheduling too. `kind` is that of a USB adapter,
+    or "8250" for QEMU's UART.
     """
     far_end: dict[str, Any] = {"serial": "uart", "family": FAMILY, "addresses": [1, 2]}
     if kind == "8250":

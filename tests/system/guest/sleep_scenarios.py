@@ -35,7 +35,7 @@ def _sleep() -> float:
 
 
 def sleep_in_poll(names: str) -> dict[str, Any]:
-    """Let the computer sleep during a poll of a port that is named by "tty" or "by-id"."""
+    """Let the computer sleep during a poll. `names` says how the port is named: "tty" or "by-id"."""
     found = _plugged_in(family=FAMILY, addresses=[1, 2], encoded=True)
     poll = Poll({"a": (found[names], [1, 2])})
     seen = poll.wait_for("ok", "a")

@@ -1,4 +1,4 @@
-"""Stalled adapters: they accept no bytes, so the driver keeps the bytes to send."""
+"""Scenarios with stalled adapters: the adapter accepts no bytes, so the driver keeps the bytes to send."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from common import FAMILY, Poll, attempt, insist, write_plant
 from multidrop import Bus, ErmanERG220, Poller
 from multidrop.transport import open_port
 
-FRAME = 8  # length in bytes of each of these drives' requests
+FRAME = 8  # length in bytes of each request in this file
 TIOCGSERIAL, TIOCSSERIAL = 0x541E, 0x541F
 SERIAL_STRUCT, CLOSING_WAIT = 72, 40  # length of Linux's struct serial_struct, and place of its closing_wait
 
@@ -23,7 +23,7 @@ SERIAL_STRUCT, CLOSING_WAIT = 72, 40  # length of Linux's struct serial_struct, 
 def close_only_if_sent(path: str) -> None:
     """Let the driver close this port only when all bytes are sent, instead of after 30 s.
 
-    A process that does not end this wait by itself then never ends.
+    So a process never ends unless it discards these bytes itself.
     """
     fd = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     settings = bytearray(SERIAL_STRUCT)
@@ -56,9 +56,8 @@ def end_of_stalled_poll(kind: str, signals: list[int]) -> dict[str, Any]:
 
 
 def start_in_stall(kind: str) -> dict[str, Any]:
-    """Call start and stop during a stall, then close; let the adapter continue; return the late frames.
-
-    `waits` has the limit in s of each wait of `close` for the adapter.
+    """Call start and stop during a stall, close the port, and let the adapter continue. Return the frames
+    that it still sends, and in `waits` the time limit in s of each wait of `close` for the adapter.
     """
     adapter = plug.Adapter(kind, f"held-{kind}", family=FAMILY, addresses=[1])
     close_only_if_sent(adapter.path)
@@ -85,9 +84,8 @@ def start_in_stall(kind: str) -> dict[str, Any]:
 
 
 def stop_in_stall(kind: str, seconds: float) -> dict[str, Any]:
-    """Call a stop in the middle of a stall of a polled line.
-
-    Return the stop's result, the frames sent after the stall, and the line's misses.
+    """Stop a drive while the adapter of its polled line stalls. Return the stop's result, the frames that are
+    sent after the stall, and the statuses of failed reads.
     """
     adapter = plug.Adapter(kind, f"stop-{kind}", family=FAMILY, addresses=[1, 2])
     stopped: list[str] = []

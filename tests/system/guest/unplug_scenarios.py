@@ -51,7 +51,9 @@ def poll_through_unplug(kinds: list[str], names: str) -> dict[str, Any]:
 
 
 def commands_while_unplugged(kind: str) -> dict[str, Any]:
-    """Call verbs of a running motor while its adapter is unplugged; a stop must get through later."""
+    """Call start, set_frequency and stop while the adapter of a running motor is unplugged. The stop must be
+    sent later.
+    """
     adapter = plug.Adapter(kind, f"verbs-{kind}", family=FAMILY, addresses=[1])
     ended: dict[str, str] = {}
     with Bus(adapter.by_id) as bus:
@@ -84,7 +86,7 @@ def changed_names(how: str) -> dict[str, Any]:
         adapter.unplug()
     seen = poll.wait_for("port lost", "a")
     count = len(first.state["requests"])
-    second.plug_in(first.socket_number)  # `second` now has the name and socket of `first`
+    second.plug_in(first.socket_number)  # `second` now has the tty name and USB socket of `first`
     time.sleep(3)
     alone = len(second.state["requests"])
     first.plug_in(second.socket_number + 1)
@@ -99,7 +101,7 @@ def changed_names(how: str) -> dict[str, Any]:
 
 
 def other_socket(is_anonymous: bool, names: str) -> dict[str, Any]:
-    """Poll an adapter that is plugged into another USB socket, and then into the first again."""
+    """Poll through an adapter that is moved to another USB socket and back."""
     adapter = _encoded("ftdi", "moved", [1, 2], is_anonymous=is_anonymous)
     socket_number = adapter.socket_number
     name = getattr(adapter, names)
@@ -117,7 +119,9 @@ def other_socket(is_anonymous: bool, names: str) -> dict[str, Any]:
 
 
 def doctor_without_serial_number() -> dict[str, Any]:
-    """Return what `doctor` says about an adapter without a serial number, and its links in /dev/serial."""
+    """Return what `multidrop doctor` says about an adapter without a serial number, and the adapter's links
+    in /dev/serial.
+    """
     adapter = plug.Adapter("ftdi", "anonymous", is_anonymous=True)
     _, text = run("doctor", adapter.path, "--json")
     findings = {finding["topic"]: finding for finding in json.loads(text)["findings"]}
@@ -135,7 +139,7 @@ def _reset(serial: str) -> None:
 
 
 def reset_in_poll(kind: str, names: str) -> dict[str, Any]:
-    """Reset the adapter under a poll."""
+    """Reset the adapter during a poll."""
     adapter = _encoded(kind, f"reset-{kind}", [1, 2])
     poll = Poll({"a": (getattr(adapter, names), [1, 2])})
     poll.wait_for("ok", "a")
@@ -172,7 +176,7 @@ def reset_in_start(kind: str, delays: list[float]) -> list[dict[str, Any]]:
 
 
 def damaged_replies(format: str, kinds: list[str]) -> dict[str, Any]:
-    """Read while every reply has an error that the FTDI chip reports in its status, then while none has."""
+    """Read while the FTDI chip reports an error in the status of every reply. Then read without errors."""
     adapter = plug.Adapter("ftdi", "damaged")
     with Bus(adapter.path, baudrate=19200, format=format) as bus:
         meter = bus.attach(Meter, address=2)
