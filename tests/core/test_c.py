@@ -21,7 +21,7 @@ def core_without(*replaced: str) -> list[str]:
 
 @pytest.fixture
 def build(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[..., None]:
-    """Return a function that builds and runs a C test program; all workers share the object files."""
+    """Return a function that builds and runs a C test program. All pytest workers share the object files."""
     shared = tmp_path_factory.getbasetemp()
     shared = (shared.parent if "PYTEST_XDIST_WORKER" in os.environ else shared) / "objects"
     shared.mkdir(exist_ok=True)
@@ -33,13 +33,13 @@ def build(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[
 
 
 @pytest.mark.slow
-def test_core(build: Callable[..., None]) -> None:
+def test_the_c_tests_of_the_core_pass(build: Callable[..., None]) -> None:
     core = ("body", "frame", "tap", "line", "reply", "tcp", "late", "stats", "columns")
     build("test_core", *core, arguments=["tests/data/frames.csv"])
 
 
 @pytest.mark.slow
-def test_rows(build: Callable[..., None]) -> None:
+def test_the_c_tests_of_rows_pass(build: Callable[..., None]) -> None:
     build("test_rows", "columns", "tap", "body", "frame")
 
 
@@ -61,7 +61,7 @@ def test_threads_can_open_and_close_ports_concurrently(
 
 @pytest.mark.slow
 @WAITS_BY_EPOLL
-def test_a_client_that_returns_within_the_silence_does_not_wake_the_thread(
+def test_a_call_within_the_silence_after_an_exchange_does_not_wake_the_thread(
     build: Callable[..., None],
 ) -> None:
     build("test_wakings", *core_without("waiter_poll", "wakeup"))
@@ -69,7 +69,7 @@ def test_a_client_that_returns_within_the_silence_does_not_wake_the_thread(
 
 @pytest.mark.slow
 @WAITS_BY_EPOLL
-def test_the_thread_does_not_spin_for_a_waiting_client(build: Callable[..., None]) -> None:
+def test_the_cores_thread_does_not_spin_while_a_caller_waits(build: Callable[..., None]) -> None:
     build("test_spinning", *core_without("waiter_poll", "clock"))
 
 
@@ -86,12 +86,12 @@ def test_a_transceiver_sends_until_the_last_bit_has_left(build: Callable[..., No
 
 @pytest.mark.slow
 @WAITS_BY_EPOLL
-def test_a_command_that_waits_too_long_for_rts_is_called_off(build: Callable[..., None]) -> None:
+def test_a_command_that_waits_too_long_for_rts_is_cancelled(build: Callable[..., None]) -> None:
     build("test_stuck_rts", *core_without("waiter_poll"))
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the driver is Linux's")
-def test_a_baud_rate_without_a_whole_divisor_is_refused(build: Callable[..., None]) -> None:
+def test_a_baud_rate_without_an_integer_divisor_is_refused(build: Callable[..., None]) -> None:
     build("test_divisors", "termios")
 
 

@@ -67,7 +67,7 @@ def test_a_printed_exchange_is_split_into_a_request_and_its_reply(reply: Printed
 
 
 @given(st.lists(st.sampled_from(REPLIES), max_size=30), st.data())
-def test_the_same_frames_are_found_however_the_bytes_are_divided(
+def test_the_same_frames_are_found_if_their_bytes_arrive_in_any_pieces(
     line: list[Printed], data: st.DataObject
 ) -> None:
     bytes_ = READ + ANSWER + b"".join(each.request_frame + each.frame for each in line)
@@ -91,20 +91,20 @@ def test_the_same_frames_are_found_however_the_bytes_are_divided(
         st.binary(min_size=1, max_size=40) | st.sampled_from([reply.frame for reply in REPLIES]), max_size=30
     )
 )
-def test_every_byte_is_reported_exactly_once(pieces: list[bytes]) -> None:
+def test_every_sniffed_byte_is_reported_exactly_once(pieces: list[bytes]) -> None:
     assert b"".join(span.raw for span in split(*pieces)) == b"".join(pieces)
 
 
-def test_a_frame_has_the_time_of_its_first_piece() -> None:
+def test_a_sniffed_frame_has_the_time_of_its_first_piece() -> None:
     spans = split(READ[:3], READ[3:] + ANSWER[:2], ANSWER[2:], b"\xff")
     assert [span.time_ns for span in spans] == [0, 1, 3]
 
 
-def test_a_copy_right_after_its_request_is_a_reply() -> None:
+def test_a_copy_of_a_write_request_right_after_it_is_its_reply() -> None:
     assert kinds(split(READ, ANSWER, *[WRITE] * 6)) == [Kind.REQUEST, Kind.REPLY] * 4
 
 
-def test_a_copy_after_junk_is_neither_request_nor_reply() -> None:
+def test_a_copy_of_a_write_request_after_junk_is_neither_request_nor_reply() -> None:
     assert kinds(split(WRITE)) == [Kind.EITHER]
     assert kinds(split(READ, ANSWER, WRITE[:-1], WRITE, READ)) == [
         *(Kind.REQUEST, Kind.REPLY, Kind.JUNK, Kind.EITHER, Kind.REQUEST)
@@ -121,7 +121,7 @@ def test_a_delixi_reply_is_not_mistaken_for_a_request() -> None:
     ]
 
 
-def test_the_senders_side_distinguishes_copies_from_requests() -> None:
+def test_a_repeated_write_request_is_no_reply_if_the_sender_of_bytes_is_known() -> None:
     stream = Stream()
     stream.put(WRITE, 0, side=Side.ANSWERING)
     stream.put(WRITE, 1, side=Side.ASKING)
@@ -145,12 +145,12 @@ def test_a_reply_after_a_damaged_request_is_stray() -> None:
     ]
 
 
-def test_a_stray_reply_does_not_end_an_exchange() -> None:
+def test_a_reply_that_fits_no_request_does_not_end_an_exchange() -> None:
     other = bytes.fromhex("02 83 02 30 F1")
     assert kinds(split(READ, other, ANSWER)) == [Kind.REQUEST, Kind.STRAY, Kind.REPLY]
 
 
-def test_of_two_equal_requests_only_the_last_gets_the_reply() -> None:
+def test_a_reply_after_two_equal_requests_belongs_to_the_second() -> None:
     assert kinds(split(READ, READ, ANSWER, ANSWER)) == [*(Kind.REQUEST, Kind.REQUEST, Kind.REPLY, Kind.STRAY)]
 
 
@@ -176,7 +176,7 @@ def test_a_pause_ends_a_frame_that_starts_in_junk(first: str) -> None:
     assert b"".join(span.raw for span in spans if span.kind is Kind.JUNK) == ANSWER[:2] + junk
 
 
-def test_without_pauses_the_splitter_waits_until_a_long_frame_could_be_whole() -> None:
+def test_without_pauses_the_splitter_waits_for_the_rest_of_a_long_frame() -> None:
     stream, splitter = Stream(), Splitter()
     stream.put(bytes.fromhex("01 10 00 00 00 7B F6") + OTHER_READ, 0)
     assert list(splitter.spans(stream)) == []
@@ -190,7 +190,7 @@ def test_bytes_that_cannot_be_a_frame_are_reported_as_junk_immediately() -> None
     assert sum(len(span.raw) for span in splitter.spans(stream)) > 990
 
 
-def test_putting_bytes_into_a_full_stream_raises() -> None:
+def test_adding_bytes_to_a_full_stream_raises() -> None:
     stream = Stream()
     stream.put(bytes(STREAM_ROOM), 0)
     with pytest.raises(BufferError, match=r"take its frames with Splitter\.spans first"):
@@ -226,7 +226,7 @@ def test_every_exchange_that_is_not_next_to_damage_is_found(seed: int) -> None:
         assert (Kind.REQUEST, i, sent[i]) in spans
         assert (Kind.REPLY, i + 1, sent[i + 1]) in spans
     frames = [span for span in found if span.kind is not Kind.JUNK]
-    for asked, answered in pairwise(frames):  # checks also that no reply is assigned to another request
+    for asked, answered in pairwise(frames):  # checks also that each reply is assigned to its request
         if answered.kind is Kind.REPLY:
             assert answered.time_ns == asked.time_ns + 1 or answered.raw == asked.raw
 

@@ -1,4 +1,4 @@
-"""Columns from completions: numbers of every format, scales, missing values, and the columns' capacity."""
+"""Columns that the core fills from replies: number formats, scales, missing values and capacity."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_every_half_float_equals_struct() -> None:
         assert math.copysign(1, found) == math.copysign(1, number) or math.isnan(number)
 
 
-def test_every_number_format_is_tested() -> None:
+def test_the_list_of_tested_number_formats_is_complete() -> None:
     assert {wire & (LOW_WORD_FIRST - 1) for wire, _, _ in NUMBERS} == set(NumberFormat)
 
 
@@ -105,7 +105,7 @@ def test_a_number_beyond_the_end_of_the_data_is_nan(wire: NumberFormat) -> None:
 
 
 def completed(request: Message, received: bytes) -> Any:
-    """Return the completion of an exchange sent at 1000 ms, whose reply starts 30 ms later."""
+    """Return the result of an exchange sent at 1000 ms, whose reply starts 30 ms later."""
     line = LineDriver()
     line.begin(
         Exchange(
@@ -130,7 +130,7 @@ def reply(*values: int) -> Any:
     return completed(request, build_reply(Framing.RTU, Message(1, 0x03, data=words(*values))))
 
 
-def test_a_block_makes_one_row_for_each_field() -> None:
+def test_a_reply_gives_one_row_for_each_register_of_its_block() -> None:
     block = RowLayout(
         5,
         [
@@ -173,7 +173,7 @@ ONE = RowLayout(1, [Field(0, NumberFormat.U16, 2, 1, 1)])
         (build_reply(Framing.RTU, Message(1, 0x03, exception=0x12)), EXCEPTION_STATUS + 0x12, "exception 12"),
     ],
 )
-def test_missing_value_has_a_row_with_its_status(received: bytes, status: int, text: str) -> None:
+def test_a_missing_value_has_a_row_with_the_reason_as_status(received: bytes, status: int, text: str) -> None:
     columns = Columns(1)
     assert add_rows(columns, ONE, completed(Message(1, 0x03, 0, 1), received), UTC)
     assert list(columns.array("status")) == [status]
@@ -182,14 +182,14 @@ def test_missing_value_has_a_row_with_its_status(received: bytes, status: int, t
     assert (columns.array("time")[0], columns.array("uncertainty")[0]) == (UTC + 1000 * MS, 0)
 
 
-def test_a_due_value_that_was_not_requested_has_a_row() -> None:
+def test_a_value_that_was_due_but_not_requested_has_a_row() -> None:
     columns = Columns(2)
     assert add_miss(columns, ONE, Status.NOT_ASKED, 77 * MS, UTC)
     assert (columns.array("status")[0], columns.array("sent")[0]) == (Status.NOT_ASKED, 77 * MS)
     assert columns.array("valid")[0] & 1 == 0
 
 
-def test_a_row_of_an_unsent_request_has_the_time_of_its_turn() -> None:
+def test_the_row_of_an_unsent_request_has_the_time_at_which_its_turn_came() -> None:
     line = LineDriver()
     line.now = 5000 * MS
     line.begin(
@@ -209,7 +209,7 @@ def test_a_row_of_an_unsent_request_has_the_time_of_its_turn() -> None:
     assert (columns.array("time")[0], columns.array("status")[0]) == (UTC + 5000 * MS, Status.LINE_LOST)
 
 
-def test_a_field_beyond_the_end_of_the_reply_has_a_row_without_value() -> None:
+def test_a_register_beyond_the_end_of_the_reply_has_a_row_without_value() -> None:
     columns = Columns(2)
     block = RowLayout(1, [Field(0, NumberFormat.U16, 2, 1, 1), Field(1, NumberFormat.U16, 3, 1, 1)])
     assert add_rows(columns, block, reply(9), 0)
@@ -227,7 +227,7 @@ def test_the_bitmap_marks_rows_with_a_value() -> None:
     assert [valid[at // 8] >> at % 8 & 1 for at in range(20)] == pattern
 
 
-def test_a_block_that_does_not_fit_into_the_columns_adds_no_row() -> None:
+def test_a_reply_whose_rows_do_not_fit_into_the_columns_adds_no_row() -> None:
     columns = Columns(3)
     two = RowLayout(1, [Field(0, NumberFormat.U16, 2, 1, 1), Field(1, NumberFormat.U16, 3, 1, 1)])
     answer = reply(1, 2)
@@ -256,7 +256,7 @@ def test_codes_of_names_added_later_are_converted_too() -> None:
     assert (numbers, bytes(text).decode()) == ([0, 1, 0, 2], "".join(["pump", "fan", "pump", "насос"]))
 
 
-def test_no_codes_give_an_empty_column() -> None:
+def test_an_empty_list_of_codes_gives_an_empty_column() -> None:
     offsets, text = spell(memoryview(array("H")), Names("a"))
     assert (list(offsets), bytes(text)) == ([0], b"")
 
@@ -264,7 +264,7 @@ def test_no_codes_give_an_empty_column() -> None:
 BLOCK = RowLayout(0, [Field(0, NumberFormat.U16, register, 1.0, 1.0) for register in range(3)])
 
 
-def test_a_block_without_fields_adds_no_row() -> None:
+def test_a_reply_of_a_block_without_registers_adds_no_row() -> None:
     row_queue = RowQueue()
     row_queue.add_miss(RowLayout(0, []), Status.NOT_ASKED, 5)
     assert (row_queue.chunks, row_queue.dropped, row_queue.take()) == (0, 0, None)
@@ -276,8 +276,8 @@ def test_rows_of_a_block_larger_than_a_chunk_are_counted_as_dropped() -> None:
     assert row_queue.dropped == 3
 
 
-def test_more_chunks_than_the_queue_keeps_can_be_given_back() -> None:
-    """A reader returns more chunks of memory than the queue keeps for reuse. The queue frees the rest."""
+def test_the_row_queue_frees_chunks_of_memory_that_it_does_not_keep_for_reuse() -> None:
+    """The reader returns more chunks than the queue keeps."""
     row_queue = RowQueue(chunk_rows=3, most_chunks=100)
     for turn in (1, 2):
         for due in range(100):
@@ -307,7 +307,7 @@ def as_float32(bits: int) -> Fraction:
 
 @given(st.lists(st.one_of(st.integers(-(2**63), 2**63 - 1), st.sampled_from(EDGES)), max_size=9))
 def test_a_bound_is_rounded_up_to_the_next_float(numbers: list[int]) -> None:
-    """The bits of the next float, read as an integer, are greater by one (IEEE 754)."""
+    """In IEEE 754, the bits of the next float are those of the float plus one, as an integer."""
     narrow = bytes(narrow_up(memoryview(array("q", numbers))))
     for number, bits in zip(numbers, struct.unpack(f"<{len(numbers)}I", narrow), strict=True):
         found = as_float32(bits)
@@ -321,7 +321,7 @@ def test_a_bound_is_rounded_up_to_the_next_float(numbers: list[int]) -> None:
         assert number <= found <= number + abs(number) // 2**23
 
 
-def test_widening_reads_only_valid_numbers() -> None:
+def test_an_array_is_widened_from_its_valid_numbers_only() -> None:
     floats = struct.pack("<4f", 7.0, float("nan"), float("inf"), 1e30)
     assert list(widen(memoryview(floats), memoryview(b"\x01"), 4).cast("q")) == [7, 0, 0, 0]
     for bit in (2, 4, 8):
@@ -356,7 +356,7 @@ codes = st.integers(0, 65535)
 
 
 @given(st.lists(codes))
-def test_the_greatest_code_is_found(given_codes: list[int]) -> None:
+def test_the_greatest_code_of_a_column_is_found(given_codes: list[int]) -> None:
     assert greatest_code(memoryview(array("H", given_codes))) == max(given_codes, default=0)
 
 

@@ -1,4 +1,4 @@
-"""Exchanges on real descriptors, and the results when they fail."""
+"""Exchanges on real file descriptors: queues, urgent exchanges, stops, failures and closing."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def read(
     echo_probe: Exchange | None = None,
     values: RowLayout | None = None,
 ) -> Exchange:
-    """Return a read of one register. The default `timeout` (s) never ends in a passing test."""
+    """Return a read of one register. The default `timeout` (s) is longer than any passing test."""
     return Exchange(
         Framing.RTU,
         Message(1, 0x03, start, 1),
@@ -92,7 +92,7 @@ def wait_until(look: Callable[[], bool]) -> None:
 
 
 class Rows:
-    """The rows of a port's exchanges, in the order in which these were carried out."""
+    """The rows of a port's exchanges, in the order of the exchanges."""
 
     def __init__(self, port: Port) -> None:
         self.row_queue = RowQueue()
@@ -100,7 +100,7 @@ class Rows:
         port.report_to(self.row_queue, 0)
 
     def of(self, name: str, rows: int) -> list[int]:
-        """Wait until there are `rows` rows; return their column of this name."""
+        """Wait until there are `rows` rows; return the column `name` of these rows."""
         wait_until(lambda: self._taken() >= rows)
         return [each for columns in self._columns for each in columns.array(name)]
 
@@ -119,7 +119,7 @@ def echo_start(request: Message) -> bytes:
 def noting(
     requested: list[int], answer: Callable[[Message], bytes] = echo_start
 ) -> Callable[[Message], bytes]:
-    """Return a drive that replies like `answer`, and appends the address of each request to `requested`."""
+    """Return a function that replies like `answer`, and appends each requested address to `requested`."""
 
     def note_and_answer(request: Message) -> bytes:
         requested.append(request.start)
@@ -220,8 +220,8 @@ def test_no_queued_request_is_sent_before_its_time(drive: Drive) -> None:
     assert all(at >= wanted for at, wanted in zip(sent, due, strict=True))
 
 
-def test_missed_slots_are_skipped_except_the_last(drive: Drive) -> None:
-    """The last due slot of each exchange is carried out, however late it is."""
+def test_all_missed_time_slots_of_an_exchange_are_skipped_except_the_last(drive: Drive) -> None:
+    """The last slot that is due is used, however late it is."""
     second = 1_000_000_000
     fast, slow, in_turn = read(1, period=1.0), read(2, period=30.0), read(3)
     with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
@@ -234,7 +234,7 @@ def test_missed_slots_are_skipped_except_the_last(drive: Drive) -> None:
     assert fast.peer.counters().missed == {Status.EXPIRED: 2}
 
 
-def test_a_late_slot_is_sent_while_the_next_one_is_not_due(drive: Drive) -> None:
+def test_a_late_request_is_sent_if_the_next_time_slot_is_not_due_yet(drive: Drive) -> None:
     with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
         rows, now = Rows(port), now_ns()
         poll = read(1, period=1.0)
@@ -242,7 +242,7 @@ def test_a_late_slot_is_sent_while_the_next_one_is_not_due(drive: Drive) -> None
         assert rows.of("status", 1) == [0]
 
 
-def test_exchanges_are_repeated_until_they_are_replaced(drive: Drive) -> None:
+def test_repeat_repeats_exchanges_until_they_are_replaced(drive: Drive) -> None:
     with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
         rows = Rows(port)
         port.repeat([read(0), read(1), read(2)])
@@ -256,7 +256,7 @@ def test_exchanges_are_repeated_until_they_are_replaced(drive: Drive) -> None:
         assert status_of(port.carry_out(read(9))) == 0
 
 
-def test_repeat_returns_the_index_of_the_exchange_that_was_next(drive: Drive) -> None:
+def test_repeat_returns_the_index_of_the_exchange_that_would_have_been_next(drive: Drive) -> None:
     with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
         rows = Rows(port)
         port.repeat([read(0), read(1), read(2)])
@@ -266,7 +266,7 @@ def test_repeat_returns_the_index_of_the_exchange_that_was_next(drive: Drive) ->
         assert following == (rows.of("value", 20)[-1] + 1) % 3
 
 
-def test_queued_exchanges_interrupt_the_repeated_round(drive: Drive) -> None:
+def test_queued_exchanges_are_carried_out_between_repeated_exchanges(drive: Drive) -> None:
     with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
         rows = Rows(port)
         port.repeat([read(0)])
@@ -275,7 +275,7 @@ def test_queued_exchanges_interrupt_the_repeated_round(drive: Drive) -> None:
         wait_until(lambda: not pending(port))
         port.stop()
         values, sent = rows.of("value", 3), rows.of("sent", 3)
-    assert values[0] == 0  # the round did not wait for the exchange that was not due
+    assert values[0] == 0  # repeated exchanges went on until the queued one was due
     at = values.index(1)
     assert values[at + 1] == 2
     assert sent[at] >= due_ns
@@ -292,7 +292,7 @@ def test_repeating_stops_when_a_request_cannot_be_sent(drive: Drive) -> None:
         assert rows.of("status", 1) == [Status.LATE_ANSWER_DUE]
 
 
-def test_the_client_is_called_when_a_drive_fails_and_when_it_recovers(drive: Drive) -> None:
+def test_await_calls_returns_when_a_drive_fails_and_when_it_recovers(drive: Drive) -> None:
     silent = threading.Event()
     silent.set()
     peer = Peer(least_timeout=0.01, most_timeout=0.3)
@@ -307,12 +307,12 @@ def test_the_client_is_called_when_a_drive_fails_and_when_it_recovers(drive: Dri
         silent.clear()
         wait_until(lambda: now_ns() > peer.late_until_ns)
         port.repeat(asked)
-        # The client is called when the drive answers again, but also at the end of the queue.
+        # await_calls also returns at the end of the queue
         while peer.failures:
             assert row_queue.await_calls(60) == [17]
 
 
-def test_the_client_is_called_when_a_drive_refuses_and_when_the_port_is_lost() -> None:
+def test_await_calls_returns_when_a_drive_refuses_and_when_a_port_is_lost() -> None:
     with opened() as (port, far):
         row_queue = RowQueue()
         port.report_to(row_queue, 3)
@@ -326,7 +326,7 @@ def test_the_client_is_called_when_a_drive_refuses_and_when_the_port_is_lost() -
         assert row_queue.await_calls(60) == [3]
 
 
-def test_dropped_rows_are_counted(drive: Drive) -> None:
+def test_rows_dropped_from_a_full_queue_are_counted(drive: Drive) -> None:
     with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
         row_queue = RowQueue(chunk_rows=10, most_chunks=2)
         port.report_to(row_queue, 0)
@@ -338,7 +338,7 @@ def test_dropped_rows_are_counted(drive: Drive) -> None:
         assert [each for columns in kept for each in columns.array("value")] == [*range(10), *range(30, 35)]
 
 
-def test_a_view_of_rows_outlives_the_rows_object(drive: Drive) -> None:
+def test_a_memoryview_of_rows_outlives_the_object_that_made_it(drive: Drive) -> None:
     with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
         row_queue = RowQueue()
         port.report_to(row_queue, 0)
@@ -353,7 +353,7 @@ def test_a_view_of_rows_outlives_the_rows_object(drive: Drive) -> None:
         assert list(values) == list(range(100))
 
 
-def test_rows_outlive_their_queue(drive: Drive) -> None:
+def test_columns_of_rows_outlive_their_queue(drive: Drive) -> None:
     with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
         row_queue = RowQueue()
         port.report_to(row_queue, 0)
@@ -424,7 +424,7 @@ def test_an_urgent_exchange_is_sent_before_the_queue(drive: Drive) -> None:
         assert pending(port) == 1
 
 
-def test_carry_out_returns_the_values_of_its_exchange(drive: Drive) -> None:
+def test_carry_out_returns_the_values_of_the_reply(drive: Drive) -> None:
     lacking = Extra(invalid=((0xFFFF, 8),))
     tenths, eight = (Field(0, NumberFormat.U16, 0, 1, 10, extra) for extra in (None, lacking))
     values = RowLayout(0, [tenths, eight])
@@ -438,7 +438,7 @@ def test_carry_out_returns_the_values_of_its_exchange(drive: Drive) -> None:
         assert again.numbers[1] != again.numbers[1]
 
 
-def test_a_completion_without_room_for_the_values_is_not_reused(drive: Drive) -> None:
+def test_result_memory_that_is_too_small_for_the_values_is_not_reused(drive: Drive) -> None:
     with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
         short = Completion()
         found = port.carry_out(read(7, values=ONE_VALUE), into=short)
@@ -447,7 +447,7 @@ def test_a_completion_without_room_for_the_values_is_not_reused(drive: Drive) ->
         assert short.result == 0
 
 
-def test_an_urgent_exchange_that_expired_is_not_sent(drive: Drive) -> None:
+def test_an_urgent_exchange_that_has_already_expired_is_not_sent(drive: Drive) -> None:
     requested: list[int] = []
     with closing(Port(drive(noting(requested)), NO_SETTINGS)) as port:
         found = port.carry_out(read(3), expires_ns=boottime_ns() - 1)
@@ -518,7 +518,7 @@ def test_a_stop_precedes_waiting_requests_and_cancels_earlier_ones_of_its_drive(
     assert (found[50].result, found[50].sent_ns) == (Failure.EXPIRED, 0)
 
 
-def test_a_write_permit_from_before_or_during_a_stop_is_never_valid_again() -> None:
+def test_a_write_permit_issued_before_or_during_a_stop_is_never_valid_again() -> None:
     latch = Latch()
     before = latch.permit()
     assert before.is_good
@@ -533,7 +533,7 @@ def test_a_write_permit_from_before_or_during_a_stop_is_never_valid_again() -> N
     assert not latch.permit().is_good
 
 
-def test_no_new_write_permit_is_valid_until_the_last_of_several_stops_has_ended() -> None:
+def test_no_write_permit_is_valid_while_one_of_several_stops_is_in_progress() -> None:
     latch = Latch()
     latch.hold(1, "a stop")
     latch.hold(2, "another stop")
@@ -581,7 +581,7 @@ def test_closing_a_port_reports_whether_each_pending_request_was_sent(drive: Dri
     assert sorted(each.sent_ns > 0 for each in found) == [False, True]
 
 
-def test_each_exchange_counted_before_its_port_closes_has_a_row() -> None:
+def test_each_exchange_that_is_counted_before_a_port_closes_has_a_row() -> None:
     """The port is closed at the moment when a reply comes."""
     values = 0
     for _ in range(60):
@@ -614,7 +614,7 @@ def wait_until_it_sleeps(thread: threading.Thread) -> None:
 def test_polling_keeps_a_share_of_the_line_during_urgent_exchanges_but_not_during_stops(
     drive: Drive, insists: bool
 ) -> None:
-    """Polling gets one exchange at a time, and never two in a row."""
+    """Between urgent exchanges, polling gets one exchange at a time, and never two in a row."""
     asked: list[str] = []
     go_on = threading.Event()
 
@@ -657,7 +657,7 @@ def test_queued_exchanges_are_kept_alive_until_they_end(drive: Drive) -> None:
         assert rows.of("value", 2) == [1, 2]
 
 
-def test_an_exception_reply_of_a_drive_gives_a_completion_with_its_code(drive: Drive) -> None:
+def test_the_result_of_an_exception_reply_has_the_exception_code(drive: Drive) -> None:
     fd = drive(lambda _: build_reply(Framing.RTU, Message(1, 0x03, exception=2)))
     with closing(Port(fd, NO_SETTINGS)) as port:
         assert status_of(port.carry_out(read(0))) == EXCEPTION_STATUS + 2
@@ -672,7 +672,7 @@ def test_queued_exchanges_continue_after_a_silent_drive(drive: Drive) -> None:
         assert rows.of("status", 3) == [0, Status.NO_REPLY, 0]
 
 
-def test_a_request_that_a_late_reply_could_answer_is_not_sent(drive: Drive) -> None:
+def test_a_request_is_not_sent_while_a_late_reply_could_pass_for_its_own(drive: Drive) -> None:
     slow = Peer(least_timeout=0.01, most_timeout=0.02)
     fd = drive(lambda request: b"" if request.start == 1 else echo_start(request))
     with closing(Port(fd, NO_SETTINGS)) as port:
@@ -709,11 +709,11 @@ def test_a_broadcast_waits_only_for_the_turnaround_delay(drive: Drive) -> None:
         sent, read_back = port.carry_out(stop), port.carry_out(read(7))
     assert (status_of(sent), status_of(read_back)) == (0, 0)
     assert requested == [0, 1]
-    assert read_back.sent_ns - sent.sent_ns >= 1_000_000  # the turnaround delay
+    assert read_back.sent_ns - sent.sent_ns >= 1_000_000  # the turnaround delay, in ns
 
 
 def test_exchanges_queued_on_a_lost_port_stay_queued() -> None:
-    """The client will queue them on the port that it opens next."""
+    """The poller queues them again on the port that it opens next."""
     with opened() as (port, far):
         far.close()
         until(lambda: port.lost)
@@ -724,7 +724,7 @@ def test_exchanges_queued_on_a_lost_port_stay_queued() -> None:
 
 @table("way", ["queued", "repeated"])
 @table("answered", [0, 1])
-def test_cut_off_is_true_if_the_port_is_lost_after_a_reply(answered: int, way: str) -> None:
+def test_cut_off_is_true_only_if_the_port_is_lost_after_a_reply(answered: int, way: str) -> None:
     with opened() as (port, far):
         todo = [read(0), read(1), read(2)]
         port.submit(todo, [0] * 3) if way == "queued" else port.repeat(todo)
@@ -739,7 +739,7 @@ def test_cut_off_is_true_if_the_port_is_lost_after_a_reply(answered: int, way: s
         if way == "queued":
             until(lambda: port.done == answered + 1)
         else:
-            assert port.repeat([]) == 1  # the second exchange is next: it was not sent yet, or was cut off
+            assert port.repeat([]) == 1  # the second exchange is next: unsent, or cut off
 
 
 def test_a_pty_whose_far_end_hangs_up_is_lost() -> None:
@@ -795,7 +795,7 @@ def test_an_invalid_descriptor_raises() -> None:
         Port(-1, NO_SETTINGS)
 
 
-def test_closing_a_port_ends_the_wait_of_its_clients(drive: Drive) -> None:
+def test_closing_a_port_wakes_the_threads_that_wait_for_it(drive: Drive) -> None:
     requested = threading.Event()
 
     def answer(_: Message) -> bytes:
@@ -821,7 +821,7 @@ def test_is_asking_is_true_for_peers_of_queued_repeated_and_urgent_exchanges() -
         assert port.is_asking(queued.peer)
         assert not port.is_asking(other.peer)
         port.repeat([repeated])
-        assert far.recv(100)  # its request is in flight
+        assert far.recv(100)  # now the request is in flight
         port.repeat([])
         assert port.is_asking(repeated.peer)
         until(lambda: not port.is_asking(repeated.peer))
@@ -836,7 +836,7 @@ def test_is_asking_is_true_for_peers_of_queued_repeated_and_urgent_exchanges() -
 
 @pytest.mark.slow
 def test_opening_and_closing_a_thousand_ports_leaks_no_descriptor(drive: Drive) -> None:
-    """The ports are opened and closed on one engine, with or without an exchange in flight."""
+    """The ports are opened and closed one after another, with or without an exchange in flight."""
 
     def come_and_go(start: int) -> int:
         with opened(room=4) as (port, _):
@@ -844,7 +844,7 @@ def test_opening_and_closing_a_thousand_ports_leaks_no_descriptor(drive: Drive) 
             port.submit(queued, [0])
         return len(list(Path("/dev/fd").iterdir()))
 
-    before = come_and_go(0)  # the engine's own descriptors exist from now on
+    before = come_and_go(0)  # opens the descriptors that the core keeps
     assert {come_and_go(start) for start in range(1, 1000)} == {before}
 
 

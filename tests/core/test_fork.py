@@ -30,14 +30,14 @@ from multidrop.poller import Poller
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 
 pytestmark = pytest.mark.filterwarnings(
-    "ignore:.*fork:DeprecationWarning",  # Python warns of held locks, which these tests need
+    "ignore:.*fork:DeprecationWarning",  # Python warns if another thread holds a lock, as in these tests
     "ignore:set(Daemon|Name)\\(\\) is deprecated:DeprecationWarning",
 )
 
 
 @contextmanager
 def child(act: Callable[[], object]) -> Iterator[Any]:
-    """Yield the result of `act` in a forked child, which lives until the end of the block."""
+    """Call `act` in a forked child and yield its result. The child lives until the end of the block."""
     ours, theirs = multiprocessing.Pipe()
 
     def run() -> None:
@@ -189,7 +189,7 @@ def test_a_child_that_discards_an_inherited_bus_does_not_disturb_the_parent(any_
 
 
 @pytest.mark.slow
-def test_a_child_that_closes_a_bridged_bus_does_not_hang_up_the_parents_port() -> None:
+def test_a_child_that_closes_an_inherited_bus_does_not_close_the_parents_port() -> None:
     with Bus("loop://") as bus:
         assert in_child(bus.close) is None
         with pytest.raises(NoReply):
@@ -212,7 +212,7 @@ def test_a_child_does_not_wait_for_a_bus_lock_held_in_the_parent(port: str) -> N
 
     with Bus(port) as bus:
         assert current(bus) == 3.25
-        # Another thread's stop is in progress. The child must not wait for its end.
+        # in the parent, a stop on another thread is in progress
         stop = threading.Thread(target=bus._latches.begin, args=["stop", bus.drives])
         stop.start()
         stop.join()
@@ -295,7 +295,7 @@ with Simulator([Wire([simulated(Toy(1))], unpaced=True)]) as simulator:
 
 
 @pytest.mark.long
-def test_the_end_of_a_child_does_not_end_the_parents_simulator() -> None:
+def test_the_exit_of_a_child_does_not_end_the_parents_simulator() -> None:
     words = [sys.executable, "-W", "ignore", "-c", LEFT.format(support=str(Path(toy.__file__).parent))]
     done = subprocess.run(words, capture_output=True, text=True, timeout=PATIENCE, check=False)
     assert (done.stdout, done.stderr, done.returncode) == ("0\n", "", 0)
@@ -326,7 +326,7 @@ ENDS = {
 
 @pytest.mark.long
 @pytest.mark.parametrize("end", ENDS)
-def test_the_end_of_a_child_does_not_stop_the_parents_motor(end: str) -> None:
+def test_the_exit_of_a_child_does_not_stop_the_parents_motor(end: str) -> None:
     """Only the parent stops the motor, when it leaves the bus."""
     sim = simulated(InvtCHE(1, maximum_frequency=50))
     assert isinstance(sim, MotorDrive)

@@ -37,7 +37,7 @@ RTU, ASCII, DELIXI = Framing.RTU, Framing.ASCII, Framing.DELIXI
 GOOD_REQUESTS = [each for each in PRINTED if each.direction == "request" and each.verdict != "bad checksum"]
 GOOD_REPLIES = [each for each in PRINTED if each.direction == "reply" and isinstance(each.says, Message)]
 REFUSED = [each for each in PRINTED if isinstance(each.says, FrameFault)]
-MISPRINTED = "01 89 01 86 50"  # E13: a drive may send this frame, but our simulators never do
+MISPRINTED = "01 89 01 86 50"  # from manual E13; accepted, but never sent by the simulators
 
 
 def parse(printed: Printed, received: bytes) -> tuple[int, Message | None]:
@@ -75,9 +75,8 @@ def carry_out(framing: Framing, request: Message, received: bytes, piece: int = 
 
 
 def test_every_printed_frame_is_parsed() -> None:
-    assert (
-        len({(each.framing, each.direction, each.frame) for each in PRINTED}) == 49 + 19
-    )  # 19 replies are copies of their requests
+    # 19 replies equal their requests
+    assert len({(each.framing, each.direction, each.frame) for each in PRINTED}) == 49 + 19
     assert len(GOOD_REQUESTS) + len(GOOD_REPLIES) + len(REFUSED) == len(PRINTED)
 
 
@@ -107,7 +106,7 @@ def test_function_89h_is_accepted_for_88h_but_never_sent() -> None:
     assert parse_reply(RTU, bytes.fromhex(MISPRINTED), Message(1, 0x03, 0, 1))[0] == FrameFault.BAD_FUNCTION
 
 
-def test_a_misprinted_frame_has_the_expected_fault() -> None:
+def test_a_frame_misprinted_in_a_manual_has_the_expected_fault() -> None:
     for printed in REFUSED:
         assert parse(printed, printed.frame) == (printed.says, None)
 
@@ -203,7 +202,7 @@ WRONG = [
     ("late, of the drive before", RTU, READ_TWO, rtu("02 03 04 11 11 22 22"), FrameFault.BAD_ADDRESS),
     ("broadcast as a reply", RTU, READ_TWO, rtu("00 03 04 11 11 22 22"), FrameFault.BAD_ADDRESS),
     ("wrong checksum", RTU, READ_TWO, bytes.fromhex("0103041111222200 00"), FrameFault.BAD_CHECKSUM),
-    # the text framings
+    # text framings: ASCII and Delixi
     ("another value as text", ASCII, WRITE_ONE, b":010600101235A2\r\n", FrameFault.BAD_ECHO),
     ("wrong checksum as text", ASCII, WRITE_ONE, b":010600101234A4\r\n", FrameFault.BAD_CHECKSUM),
     ("Delixi's sum for the checksum", ASCII, WRITE_ONE, b":0106001012345D\r\n", FrameFault.BAD_CHECKSUM),
@@ -246,10 +245,10 @@ def test_a_stray_zero_before_each_reply_loses_no_value() -> None:
 
 
 @table("code", [0xF0, 0xFC, 0xFD, 0xFE, 0xFF])
-def test_delixis_refusal_codes_are_exceptions(code: int) -> None:
+def test_refusal_codes_of_the_delixi_protocol_are_returned_as_exceptions(code: int) -> None:
     frame = build_reply(DELIXI, Message(1, RUN_FORWARD.function, exception=code))
     assert parse_reply(DELIXI, frame, RUN_FORWARD) == (21, Message(1, 2, exception=code))
-    assert parse_request(DELIXI, frame) == (FrameFault.BAD_FUNCTION, None)  # note 2: no master sends this
+    assert parse_request(DELIXI, frame) == (FrameFault.BAD_FUNCTION, None)  # no master sends it (note 2)
 
 
 def test_delixis_state_is_read_from_the_parameter_field_of_the_reply() -> None:
@@ -369,7 +368,7 @@ def test_a_request_with_251_data_bytes_raises() -> None:
 
 
 @table("count", [0, 126, 127, 128, 0xFFFF])
-def test_only_an_exception_is_a_reply_to_an_impossible_count(count: int) -> None:
+def test_only_an_exception_fits_a_sniffed_request_with_an_impossible_count(count: int) -> None:
     """A sniffed master may request any count, and an exception is a reply to that request too."""
     request = Message(1, 0x03, 0, count)
     data_len = 2 * count & 0xFF
@@ -463,7 +462,7 @@ def test_delixis_checksum_equals_printed_checksums(data: bytes, checksum: int) -
 @table("at", range(4))
 @table("more", range(4))
 def test_crc16_equals_its_bitwise_definition(at: int, more: int) -> None:
-    """Every byte value is tested at each of the four places that are processed together, and after them."""
+    """Four bytes are processed at once. Every byte value is tested at each of the four places, and after."""
     for byte in range(256):
         data = bytes(at) + bytes([byte]) + bytes(3 - at) + bytes([byte] * more)
         assert data + crc(data).to_bytes(2, "little") == checksums.rtu(data)
@@ -474,7 +473,7 @@ frames = st.binary(min_size=1, max_size=255)
 
 @settings(deadline=None)
 @given(frames)
-def test_checksum_over_a_frame_that_includes_its_checksum_is_zero(data: bytes) -> None:
+def test_a_checksum_over_a_frame_and_its_checksum_is_zero(data: bytes) -> None:
     assert crc(data + crc(data).to_bytes(2, "little")) == 0
     assert sum8(data + bytes([lrc(data, len(data))]), len(data) + 1) == 0
 

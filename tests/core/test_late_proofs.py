@@ -19,7 +19,7 @@ AGAIN = Message(1, 6, 9, data=words(1))
 
 @pytest.fixture
 def proof(line: LineDriver, drive: Peer) -> Exchange:
-    """Let READ time out, and let the window of late replies end. Return the drive's proof, a longer read."""
+    """Let READ time out, and the time for its late reply pass. Return the drive's proof, a longer read."""
     found = exchange(LONGER, drive)
     drive.prove_by([found])
     time_out(line, drive, READ)
@@ -63,7 +63,7 @@ def test_after_the_reply_to_a_proof_no_late_reply_is_expected(
     line: LineDriver, drive: Peer, proof: Exchange, late: int
 ) -> None:
     send(line, proof)
-    for _ in range(late):  # it came before the proof's reply, and is skipped
+    for _ in range(late):  # a late reply before that of the proof is skipped
         line.receive(reply(1111))
         assert line.listens
     assert drive.counters().late == late
@@ -85,7 +85,7 @@ def test_after_an_unanswered_proof_the_late_reply_is_still_expected(
 
 
 def ask_in_vain(line: LineDriver, drive: Peer, proof: Exchange) -> None:
-    """Let the drive answer another request, but neither READ nor the proof in time."""
+    """Let the drive answer another request, but not READ and not the proof."""
     ask(line, drive, Message(1, 4, 50, 1))
     line.receive(build_reply(Framing.RTU, Message(1, 4, data=words(2222))))
     assert line.completion.result > 0
@@ -96,8 +96,10 @@ def ask_in_vain(line: LineDriver, drive: Peer, proof: Exchange) -> None:
     line.now = drive.late_until_ns + MS
 
 
-def test_a_proof_that_was_never_answered_is_dropped(line: LineDriver, drive: Peer, proof: Exchange) -> None:
-    """A device may be silent to registers that it lacks."""
+def test_a_proof_that_the_drive_never_answers_is_no_longer_sent(
+    line: LineDriver, drive: Peer, proof: Exchange
+) -> None:
+    """Some devices do not reply to reads of registers that they do not have."""
     ask_in_vain(line, drive, proof)
     assert is_barred(line, drive, OTHER)
     ask_in_vain(line, drive, proof)
@@ -105,7 +107,7 @@ def test_a_proof_that_was_never_answered_is_dropped(line: LineDriver, drive: Pee
 
 
 @pytest.mark.parametrize("is_late", [True, False])
-def test_a_proof_that_was_answered_once_is_never_dropped(
+def test_a_proof_that_was_answered_once_is_always_kept(
     line: LineDriver, drive: Peer, proof: Exchange, is_late: bool
 ) -> None:
     if is_late:
@@ -118,7 +120,9 @@ def test_a_proof_that_was_answered_once_is_never_dropped(
     assert is_barred(line, drive, OTHER)
 
 
-def test_a_silent_drive_keeps_its_proofs(line: LineDriver, drive: Peer, proof: Exchange) -> None:
+def test_a_drive_that_answers_no_request_keeps_its_proofs(
+    line: LineDriver, drive: Peer, proof: Exchange
+) -> None:
     for _ in range(3):
         send(line, proof)
         line.wait_until_done()
@@ -136,7 +140,7 @@ def test_a_stop_does_not_wait_for_the_reply_to_a_proof(line: LineDriver, drive: 
 
 @pytest.mark.usefixtures("proof")
 def test_a_late_reply_is_recognised_after_the_port_is_reopened(line: LineDriver, drive: Peer) -> None:
-    """The value may be the late reply to the first request, so outside of a poll it is read again."""
+    """The value may be the late reply to the first request, so a read by `Bus` is repeated."""
     line.lose(0)
     again = LineDriver()
     again.now = line.now
@@ -161,7 +165,7 @@ def test_a_late_reply_is_counted_once(line: LineDriver, drive: Peer) -> None:
 def test_a_reply_is_found_after_a_late_reply_that_came_during_its_request(
     line: LineDriver, drive: Peer
 ) -> None:
-    """The port took the request in two parts, and the late reply came between them."""
+    """The port accepts the request in two parts, and the late reply arrives between them."""
     line.begin(exchange(Message(1, 4, 50, 1), drive))
     while line.want != "write":
         line.now += MS
@@ -197,11 +201,9 @@ def has_sure_reply(line: LineDriver, drive: Peer) -> bool:
     return bool(line._line.is_answered)
 
 
-def test_a_reply_is_sure_unless_an_earlier_request_or_another_master_may_be_its_cause(
-    line: LineDriver, drive: Peer
-) -> None:
+def test_a_reply_is_in_doubt_if_it_may_answer_another_request(line: LineDriver, drive: Peer) -> None:
     assert has_sure_reply(line, drive)
-    line.receive(b"\xff")  # perhaps another master's request
+    line.receive(b"\xff")  # a byte that may belong to another master's request
     assert not has_sure_reply(line, drive)
     assert has_sure_reply(line, drive)
     time_out(line, drive, WRITE)
@@ -210,7 +212,9 @@ def test_a_reply_is_sure_unless_an_earlier_request_or_another_master_may_be_its_
 
 
 @pytest.mark.usefixtures("proof")
-def test_a_reply_is_sure_after_the_reply_to_a_proof(line: LineDriver, drive: Peer, proof: Exchange) -> None:
+def test_no_reply_is_in_doubt_after_the_reply_to_a_proof(
+    line: LineDriver, drive: Peer, proof: Exchange
+) -> None:
     send(line, proof)
     line.receive(PROOF_REPLY)
     assert has_sure_reply(line, drive)
@@ -245,7 +249,7 @@ def test_the_first_reply_is_in_doubt_until_a_proof_is_answered(
     ask(line, drive, READ)
     line.receive(reply(1112))
     assert (line.want, line.completion.reply.data) == ("done", words(1112))
-    assert drive.counters().late == 0  # the drive itself was always in time
+    assert drive.counters().late == 0  # this drive has answered each request in time
 
 
 def test_after_an_exception_the_first_reply_is_still_in_doubt(
@@ -269,7 +273,7 @@ def test_the_first_write_is_sent_only_after_a_reply_to_a_read(line: LineDriver, 
 
 
 @pytest.mark.usefixtures("first")
-def test_a_stop_accepts_its_first_replies(line: LineDriver, drive: Peer) -> None:
+def test_a_stop_accepts_a_first_reply_that_is_in_doubt(line: LineDriver, drive: Peer) -> None:
     for request, came in ((READ, reply(1)), (WRITE, build_reply(Framing.RTU, WRITE))):
         asked = exchange(request, drive)
         asked.c.insists = 1
@@ -278,7 +282,7 @@ def test_a_stop_accepts_its_first_replies(line: LineDriver, drive: Peer) -> None
         assert line.completion.result > 0
 
 
-def test_without_proofs_the_first_reply_is_accepted(line: LineDriver, drive: Peer) -> None:
+def test_the_first_reply_is_accepted_if_the_drive_has_no_proofs(line: LineDriver, drive: Peer) -> None:
     drive.doubt_first_reply()
     ask(line, drive, READ)
     line.receive(reply(1111))
@@ -287,7 +291,7 @@ def test_without_proofs_the_first_reply_is_accepted(line: LineDriver, drive: Pee
 
 @pytest.mark.parametrize("least", [0, 1, 0xFFFF])
 def test_a_known_value_of_any_size_identifies_a_reply(line: LineDriver, drive: Peer, least: int) -> None:
-    """Delixi's P04.28 is 0 at 1200 baud. If this 0 meant "any value", all reads would be blocked."""
+    """Delixi's P04.28 is 0 at 1200 baud. This 0 must not mean "any value": then no read would be sent."""
     known = exchange(READ, drive, answer=(least, least))
     drive.prove_by([known, exchange(OTHER, drive, answer=(7, 7))])
     time_out(line, drive, Message(1, 3, 90, 1))

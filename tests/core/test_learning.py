@@ -1,4 +1,4 @@
-"""Learning from drives: when to read the port, how long to wait, which replies may be late."""
+"""What the core learns from a drive's replies: when to read the port, how long to wait, what may be late."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def is_barred(line: LineDriver, drive: Peer, request: Message) -> bool:
     return line.want == "done" and line.completion.result == Failure.LATE_ANSWER_DUE
 
 
-def test_the_response_delay_is_learnt_from_replies(line: LineDriver, drive: Peer) -> None:
+def test_the_response_delay_of_a_drive_is_learnt_from_its_replies(line: LineDriver, drive: Peer) -> None:
     assert drive.response_delay == 0
     for _ in range(40):
         answer(line, drive, 15 * MS)
@@ -66,7 +66,7 @@ def test_the_port_is_not_read_before_a_reply_can_be_complete(line: LineDriver, d
 def looks(
     line: LineDriver, drive: Peer, delay: int, details: dict[str, RowLayout] | None = None
 ) -> tuple[int, int]:
-    """Carry out an exchange as the engine does; return the number of reads, and the last one's delay (ns)."""
+    """Carry out an exchange. Return how often the port was read, and how late after the reply's end (ns)."""
     line.begin(exchange(READ, drive, **(details or {})))
     line.wait_until_write()
     left = line.now + 8 * CHARACTER
@@ -121,7 +121,7 @@ def test_the_port_is_read_earlier_when_a_drive_becomes_quicker(line: LineDriver,
 
 
 def given_up(line: LineDriver, drive: Peer, request: Message = READ) -> int:
-    """Return the time from the request's last bit until a silent drive is given up."""
+    """Return the time from the request's last bit to the end of the wait for a silent drive."""
     left = ask(line, drive, request)
     line.wait_until_done()
     assert line.completion.result == Failure.NO_REPLY
@@ -129,9 +129,9 @@ def given_up(line: LineDriver, drive: Peer, request: Message = READ) -> int:
 
 
 def time_out(line: LineDriver, drive: Peer, request: Message = READ) -> int:
-    """Return the timeout: the result of `given_up`, minus the duration of a reply's 7 characters.
+    """Return the timeout: the result of `given_up` minus the duration of the 7 characters of a reply.
 
-    The line waits so much longer because an adapter may deliver only whole replies.
+    The line also waits for these characters, because some adapters deliver only whole replies.
     """
     return given_up(line, drive, request) - 7 * CHARACTER
 
@@ -142,7 +142,7 @@ def test_the_timeout_follows_the_drives_response_delay(line: LineDriver, drive: 
     assert 45 * MS < given_up(line, drive) - AWAITED < 60 * MS
 
 
-def test_the_timeout_is_never_shorter_than_least_timeout(line: LineDriver, drive: Peer) -> None:
+def test_a_learnt_timeout_is_never_shorter_than_least_timeout(line: LineDriver, drive: Peer) -> None:
     for _ in range(100):
         answer(line, drive, MS // 10)
     assert given_up(line, drive) == LEAST + AWAITED
@@ -162,7 +162,7 @@ def test_a_silent_drive_gets_the_longest_timeout_once_and_then_rarely(line: Line
 
 
 def test_a_write_waits_at_least_its_own_timeout_for_its_reply(line: LineDriver, drive: Peer) -> None:
-    """This holds even if reads are quick: a false report of an unconfirmed write is worse than waiting."""
+    """Its timeout does not shrink with that of reads, because an unconfirmed write is worse than waiting."""
     for _ in range(12):
         answer(line, drive, 2 * MS)
     assert given_up(line, drive) < 100 * MS
@@ -175,7 +175,7 @@ def test_a_write_waits_at_least_its_own_timeout_for_its_reply(line: LineDriver, 
 
 # ---- no byte within the timeout ----
 
-AWAITED = 3 * CHARACTER  # wait for the first character, plus two more
+AWAITED = 3 * CHARACTER  # the wait for the first character, plus two more
 LONG = Message(1, 3, 0, 100)  # its reply has 205 characters
 
 
@@ -191,14 +191,14 @@ def gathered(line: LineDriver, drive: Peer, request: Message = READ) -> None:
 
 
 @pytest.mark.parametrize("asked", [READ, LONG], ids=["short", "long"])
-def test_without_a_first_byte_the_wait_does_not_include_the_replys_length(
+def test_the_wait_for_a_reply_that_does_not_start_excludes_its_length(
     line: LineDriver, drive: Peer, asked: Message
 ) -> None:
     answer(line, drive, 2 * MS)
     assert given_up(line, drive, asked) == LEAST + AWAITED
 
 
-def test_a_reply_that_has_started_is_awaited_to_its_end(line: LineDriver, drive: Peer) -> None:
+def test_the_line_waits_for_the_end_of_a_reply_that_has_started(line: LineDriver, drive: Peer) -> None:
     answer(line, drive, 2 * MS)
     left = ask(line, drive, LONG)
     text = build_reply(Framing.RTU, Message(1, 3, data=bytes(200)))
@@ -236,7 +236,7 @@ def test_the_wait_includes_the_replys_length_if_the_adapter_delivers_whole_repli
     assert given_up(line, drive, LONG) >= LEAST + 205 * CHARACTER
 
 
-def test_noise_does_not_count_as_a_burst_of_the_adapter(line: LineDriver, drive: Peer) -> None:
+def test_noise_is_not_taken_for_an_adapter_that_sends_bytes_one_by_one(line: LineDriver, drive: Peer) -> None:
     ask(line, drive)
     line.receive(b"\x01")
     line.receive(b"\x03\x07")
@@ -257,12 +257,14 @@ def test_a_reply_after_a_shortened_wait_is_recognised_as_late(line: LineDriver, 
 # ---- late replies ----
 
 
-def test_no_request_is_sent_that_a_late_reply_could_answer(line: LineDriver, drive: Peer) -> None:
+def test_no_request_is_sent_whose_reply_could_be_mistaken_for_a_late_reply(
+    line: LineDriver, drive: Peer
+) -> None:
     time_out(line, drive)
     line.begin(exchange(OTHER, drive))
     assert line.want == "done"
     assert (line.completion.result, line.completion.sent_ns) == (Failure.LATE_ANSWER_DUE, 0)
-    assert drive.failures == 1  # only the first request failed; no second one was sent
+    assert drive.failures == 1  # only the first request was sent
 
 
 def test_a_late_reply_is_expected_after_a_lost_port_is_reopened(line: LineDriver, drive: Peer) -> None:
@@ -277,10 +279,10 @@ def test_a_late_reply_is_expected_after_a_lost_port_is_reopened(line: LineDriver
 
 
 @pytest.mark.parametrize("is_row", [True, False], ids=["for a row", "for a client"])
-def test_a_row_with_a_value_in_doubt_has_the_time_of_the_earlier_request(
+def test_a_polled_value_that_may_be_late_has_the_time_of_the_earlier_request(
     line: LineDriver, drive: Peer, is_row: bool
 ) -> None:
-    """A read outside of a poll gets no value: first a proof must show that no late reply can come."""
+    """A read by `Bus` gets no value until a proof has shown that no late reply is due."""
     drive.prove_by([exchange(LONGER, drive), exchange(Message(1, 3, 0, 3), drive)])
     rows = RowLayout(0, [Field(0, NumberFormat.U16, 0, 1.0, 1.0)]) if is_row else None
     asked = exchange(READ, drive, block=rows)
@@ -304,10 +306,10 @@ def test_a_row_with_a_value_in_doubt_has_the_time_of_the_earlier_request(
 
 
 @pytest.mark.parametrize(("asked", "times"), [(READ, 2), (WRITE, 1)], ids=["a read", "a write"])
-def test_a_read_is_repeated_after_a_doubtful_reply_and_a_write_is_not(
+def test_a_read_but_no_write_is_repeated_if_the_reply_may_be_to_another(
     drive: Peer, asked: Message, times: int
 ) -> None:
-    """A doubtful reply may be to an earlier request. A write is not repeated: it may have started a motor."""
+    """The reply may be to an earlier request. A write is not repeated: it may have started a motor."""
     slots, turn = ffi.new("struct md_slot[]", 1), ffi.new("struct md_turn *")
     wake, found = ffi.new("int64_t *"), ffi.new("struct md_completion *")
     made = exchange(asked, drive)
@@ -351,14 +353,14 @@ def test_late_replies_to_several_requests_are_expected(line: LineDriver, drive: 
     assert is_barred(line, drive, OTHER)
     line.receive(build_request(Framing.RTU, WRITE))  # the write's confirmation
     assert drive.counters().late == 1
-    assert is_barred(line, drive, OTHER)  # the reply to the first request may still come
+    assert is_barred(line, drive, OTHER)  # the late reply to READ may still come
 
 
 def test_a_write_waits_for_a_late_exception_to_another_write(line: LineDriver, drive: Peer) -> None:
     """Otherwise a second write that started a motor could be reported as refused."""
     time_out(line, drive, WRITE)
     assert is_barred(line, drive, Message(1, 6, 9, data=words(1)))
-    ask(line, drive, READ)  # an exception to a write cannot be the reply to a read
+    ask(line, drive, READ)  # a late exception to a write does not fit a read
 
 
 def delixi(function: int, start: int, value: int = 0) -> Message:
@@ -368,7 +370,7 @@ def delixi(function: int, start: int, value: int = 0) -> Message:
 @pytest.mark.parametrize(
     ("first", "second"),
     [
-        (delixi(7, 500), delixi(7, 501)),  # a reply names its parameter, a refusal does not
+        (delixi(7, 500), delixi(7, 501)),  # replies name the parameter, refusals do not
         (delixi(7, 500), delixi(7, 500)),
         (delixi(3, 0), delixi(3, 0)),
         (delixi(3, 0), delixi(7, 0)),
@@ -407,9 +409,7 @@ def test_a_stop_does_not_wait_for_late_replies(line: LineDriver, drive: Peer) ->
     assert line.wait_until_write() == build_request(Framing.RTU, WRITE)
 
 
-def test_the_timeout_of_a_stop_doubles_after_each_failure_but_the_first(
-    line: LineDriver, drive: Peer
-) -> None:
+def test_the_timeout_of_a_stop_doubles_from_its_second_failure_on(line: LineDriver, drive: Peer) -> None:
     """A stop must be repeated before the longest documented timeout has passed.
 
     The first failure is that of the read before the stop. It does not double the timeout, because other
@@ -427,7 +427,7 @@ def test_the_timeout_of_a_stop_doubles_after_each_failure_but_the_first(
     assert found == [60, 60, 120, 240, 300]
 
 
-def test_a_damaged_reply_inside_another_frame_does_not_count(line: LineDriver, drive: Peer) -> None:
+def test_bytes_like_a_damaged_reply_inside_another_frame_are_ignored(line: LineDriver, drive: Peer) -> None:
     ask(line, drive)
     inside = bytes([1, 3, 2, 0, 0, 0, 0])  # looks like a reply with a wrong checksum
     line.receive(build_reply(Framing.RTU, Message(1, 4, data=bytes(1) + inside)))
@@ -512,7 +512,7 @@ def test_a_late_reply_is_recognised_during_another_exchange_of_the_same_drive(
     line.receive(reply(1111))
     assert line.listens
     assert (drive.counters().late, drive.late_until_ns) == (1, 0)
-    line.receive(build_request(Framing.RTU, WRITE) * 2)  # the echo, then an equal confirmation
+    line.receive(build_request(Framing.RTU, WRITE) * 2)  # first the echo, then the equal confirmation
     assert line.completion.result == 8
 
 
@@ -525,8 +525,8 @@ def test_a_late_reply_is_not_reported_as_a_reply_from_another_address(line: Line
     assert other.late_until_ns > line.now
 
 
-def test_data_like_a_late_reply_stay_part_of_the_reply(line: LineDriver, drive: Peer) -> None:
-    """A good reply is accepted although it contains a copy of a late reply, which is still expected."""
+def test_a_reply_is_accepted_although_its_data_look_like_a_late_reply(line: LineDriver, drive: Peer) -> None:
+    """The data of the reply contain a copy of the late reply that is due."""
     time_out(line, drive)
     until = drive.late_until_ns
     inside = reply(1111) + b"\x00"
@@ -581,7 +581,7 @@ def all_looks(
     return [looks(line, drive, delay, details) for delay in delays]
 
 
-def test_seven_of_eight_reads_for_a_client_come_when_the_reply_is_whole(
+def test_seven_of_eight_replies_for_a_waiting_caller_need_only_one_read(
     line: LineDriver, drive: Peer
 ) -> None:
     all_looks(line, drive, STEADY, FOR_A_CLIENT)
@@ -590,29 +590,25 @@ def test_seven_of_eight_reads_for_a_client_come_when_the_reply_is_whole(
     assert max(late for _, late in found) <= CHARACTER
 
 
-def test_polled_replies_are_always_read_early(line: LineDriver, drive: Peer) -> None:
+def test_polled_replies_are_read_without_delay(line: LineDriver, drive: Peer) -> None:
     all_looks(line, drive, STEADY, FOR_A_CLIENT)
     found = all_looks(line, drive, STEADY, FOR_A_ROW)
     assert min(times for times, _ in found) > 1
     assert {late for _, late in found} == {0}
 
 
-def test_replies_of_an_unsteady_drive_are_read_early(line: LineDriver, drive: Peer) -> None:
+def test_replies_of_a_drive_with_varying_delays_are_read_without_delay(line: LineDriver, drive: Peer) -> None:
     all_looks(line, drive, 20 * [15 * MS, 19 * MS], FOR_A_CLIENT)
     assert {late for _, late in all_looks(line, drive, 20 * [15 * MS, 19 * MS], FOR_A_CLIENT)} == {0}
 
 
-def test_reads_for_a_client_come_earlier_when_a_steady_drive_becomes_quicker(
-    line: LineDriver, drive: Peer
-) -> None:
+def test_the_port_is_read_earlier_when_a_steady_drive_becomes_quicker(line: LineDriver, drive: Peer) -> None:
     all_looks(line, drive, [*STEADY, *(120 * [5 * MS])], FOR_A_CLIENT)
     assert looks(line, drive, 5 * MS, FOR_A_CLIENT)[1] <= CHARACTER
     assert drive.response_delay < 6e-3
 
 
-def test_reads_for_a_client_come_later_when_a_steady_drive_becomes_slower(
-    line: LineDriver, drive: Peer
-) -> None:
+def test_the_port_is_read_later_when_a_steady_drive_becomes_slower(line: LineDriver, drive: Peer) -> None:
     found = all_looks(line, drive, [*STEADY, *(120 * [18 * MS])], FOR_A_CLIENT)
     assert max(late for _, late in found) <= CHARACTER
     assert drive.response_delay > 17.5e-3

@@ -26,11 +26,11 @@ from multidrop.core import (
     crc16,
 )
 
-CHARACTER = 1 * MS  # a round number: requests of 8 characters take 8 ms
+CHARACTER = 1 * MS  # a request of 8 characters takes 8 ms
 SILENCE = 4 * MS
 TIMEOUT = 100 * MS
 TURNAROUND = 200 * MS
-ETIMEDOUT = 138 if sys.platform == "win32" else errno.ETIMEDOUT  # C's number, not Winsock's
+ETIMEDOUT = 138 if sys.platform == "win32" else errno.ETIMEDOUT  # the number in C, which is not Winsock's
 
 READ = Message(1, 0x03, 0, 1)
 READ_TWO = Message(1, 0x03, 0, 2)
@@ -88,19 +88,19 @@ def exchanged(line: LineDriver, received: bytes, request: Message = READ, piece:
 
 
 def test_the_time_of_a_value_is_never_after_its_reply(line: LineDriver) -> None:
-    """The write blocked the thread, perhaps for long after the request was sent."""
+    """The thread may notice late that the request was sent, because writing to the port blocked it."""
     line.begin(exchange(READ))
     while line.want != "write":
         line.now = max(line.now, line.wake)
     begun = line.now
     line.take(held_up=10 * MS)
-    line.receive(reply_of(7))  # the reply had arrived before the thread continued
+    line.receive(reply_of(7))  # the reply came while the thread was blocked
     assert line.want == "done"
     assert (line.completion.sent_ns, line.completion.first_ns) == (begun, begun + 10 * MS)
 
 
-def test_on_a_port_faster_than_its_settings_the_first_byte_has_its_read_time(line: LineDriver) -> None:
-    """A pseudo-terminal's replies come whole: its drive may have read the value just before."""
+def test_a_value_from_a_pseudo_terminal_has_the_time_of_the_read(line: LineDriver) -> None:
+    """A pseudo-terminal transfers a reply at once, so the drive may have read the value just before."""
     ask(line)
     line.now += 1 * MS
     answer(line, reply_of(7))
@@ -130,11 +130,11 @@ def test_no_request_is_sent_before_the_required_silence_has_passed(line: LineDri
         assert line.listens
         assert line.wake == opened + SILENCE
     line.now = opened + SILENCE
-    assert [line.want, line.want] == ["read", "write"]  # one more read, in case bytes have come
+    assert [line.want, line.want] == ["read", "write"]  # the line reads once more before it writes
 
 
 @pytest.mark.parametrize(("before", "after"), [(4, 10), (10, 4), (7, 7)])
-def test_the_silence_is_the_longer_of_those_of_both_exchanges(
+def test_the_silence_between_two_exchanges_is_the_longer_of_their_silences(
     line: LineDriver, before: int, after: int
 ) -> None:
     line.begin(exchange(READ, silence=before * MS))
@@ -184,7 +184,7 @@ def test_a_request_is_sent_after_a_timeout_even_if_the_line_is_never_silent(line
     assert (line.completion.reply.data, line.completion.stale) == (words(7), reads)
 
 
-def test_a_request_is_sent_after_the_timeout_even_if_the_flood_continues(line: LineDriver) -> None:
+def test_a_request_is_sent_after_the_timeout_even_if_bytes_keep_coming(line: LineDriver) -> None:
     line.begin(exchange(READ))
     line.now += SILENCE + TIMEOUT
     for _ in range(3):
@@ -194,8 +194,8 @@ def test_a_request_is_sent_after_the_timeout_even_if_the_flood_continues(line: L
     raise AssertionError("it still looks at the flood")
 
 
-def test_a_flood_on_an_idle_line_belongs_to_no_exchange(line: LineDriver) -> None:
-    """A flood before the first exchange belongs to no exchange either."""
+def test_bytes_received_on_an_idle_line_belong_to_no_exchange(line: LineDriver) -> None:
+    """This includes bytes that come before the first exchange."""
     for value in range(3):
         line.receive(b"\xff" * 4000)
         found = exchanged(line, reply_of(value))
@@ -346,12 +346,13 @@ def test_the_timeout_counts_from_the_requests_last_bit_and_includes_the_replys_t
     assert line.listens
     assert line.wake == sent + 8 * CHARACTER + TIMEOUT + 7 * CHARACTER
     line.now = line.wake
-    assert [line.want, line.want] == ["read", "done"]  # reads once more, because the host may have woken late
+    # the line reads once more at the timeout, because it may have been woken late
+    assert [line.want, line.want] == ["read", "done"]
     found = line.completion
     assert (found.result, found.raw, found.first_ns, found.last_ns) == (Failure.NO_REPLY, b"", 0, 0)
 
 
-def test_a_reply_in_the_last_read_is_accepted(line: LineDriver) -> None:
+def test_a_reply_that_is_read_at_the_timeout_is_accepted(line: LineDriver) -> None:
     ask(line)
     assert line.listens
     line.now = line.wake + 50 * MS
@@ -360,7 +361,7 @@ def test_a_reply_in_the_last_read_is_accepted(line: LineDriver) -> None:
     assert (line.want, line.completion.reply.data) == ("done", words(3))
 
 
-def test_the_exchange_ends_after_the_read_at_its_timeout(line: LineDriver) -> None:
+def test_an_exchange_ends_after_one_read_at_its_timeout(line: LineDriver) -> None:
     ask(line)
     assert line.listens
     line.now = line.wake
@@ -420,7 +421,7 @@ def test_the_result_at_the_timeout_gives_the_reason(
 # ---- late replies, doubled replies, noise ----
 
 
-def test_a_late_reply_is_drained_before_the_next_request(line: LineDriver) -> None:
+def test_a_late_reply_is_discarded_before_the_next_request(line: LineDriver) -> None:
     ask(line)
     line.wait_until_done()
     assert line.completion.result == Failure.NO_REPLY
@@ -461,7 +462,9 @@ def test_a_reply_is_found_after_4096_bytes_of_noise(line: LineDriver, seed: int,
 
 
 @pytest.mark.parametrize("received", [b"\x01\x03\xfa", b"\x01", b"\x01\x83", b"\x04\x04", b"\xff"])
-def test_each_search_of_endless_garbage_repeats_less_than_a_frame(line: LineDriver, received: bytes) -> None:
+def test_a_search_in_endless_garbage_keeps_less_than_a_frame_of_bytes(
+    line: LineDriver, received: bytes
+) -> None:
     ask(line, Message(1, 0x03, 0, 125))
     garbage = received * 20_000
     for at in range(0, len(garbage), 64):
@@ -475,7 +478,7 @@ def test_each_search_of_endless_garbage_repeats_less_than_a_frame(line: LineDriv
 # ---- broadcasts ----
 
 
-def test_a_broadcast_ends_once_sent_and_the_turnaround_delay_follows(line: LineDriver) -> None:
+def test_a_broadcast_ends_when_it_is_sent_and_the_turnaround_delay_follows(line: LineDriver) -> None:
     ask(line, BROADCAST)
     sent = line.now
     assert line.want == "done"
@@ -538,7 +541,7 @@ def confirmation() -> bytes:
 
 
 @pytest.mark.parametrize("piece", [4096, 1], ids=["whole", "byte by byte"])
-def test_the_echo_of_a_write_is_not_its_confirmation(line: LineDriver, piece: int) -> None:
+def test_the_echo_of_a_write_is_not_taken_for_its_confirmation(line: LineDriver, piece: int) -> None:
     teach_echo(line)
     ask(line, WRITE)
     line.receive(confirmation(), piece)
@@ -615,7 +618,7 @@ def test_a_reply_is_found_after_a_damaged_echo(line: LineDriver, cut: tuple[int,
     assert exchanged(line, confirmation(), WRITE).result == Failure.NO_REPLY
 
 
-def test_after_two_replies_without_echo_a_confirmation_is_accepted_again(line: LineDriver) -> None:
+def test_confirmations_are_accepted_again_after_two_replies_without_an_echo(line: LineDriver) -> None:
     """One reply without echo is not enough: the echo may have been lost."""
     teach_echo(line)
     exchanged(line, reply_of(1))
@@ -644,14 +647,14 @@ def test_confirmations_are_accepted_until_an_echo_is_found(line: LineDriver) -> 
     assert exchanged(line, confirmation(), WRITE).result == Failure.NO_REPLY
 
 
-def test_a_configured_echo_is_never_unlearnt(line: LineDriver) -> None:
+def test_a_configured_echo_is_expected_even_after_replies_without_an_echo(line: LineDriver) -> None:
     line.set_echo(lib.MD_ECHO)
     for _ in range(3):
         assert exchanged(line, reply_of(1)).result == 7  # the request's echo was lost
     assert exchanged(line, confirmation(), WRITE).result == Failure.NO_REPLY
 
 
-def test_with_a_configured_echo_the_echo_of_a_delixi_query_is_not_a_value(line: LineDriver) -> None:
+def test_the_configured_echo_of_a_delixi_query_is_not_taken_for_a_value(line: LineDriver) -> None:
     query, value = Message(1, 0x07, 0x01F4, data=bytes(4)), b"\0\0\x13\x88"
     line.set_echo(lib.MD_ECHO)
     line.begin(exchange(query, framing=Framing.DELIXI))
@@ -661,12 +664,12 @@ def test_with_a_configured_echo_the_echo_of_a_delixi_query_is_not_a_value(line: 
     assert (line.completion.reply.data, line.completion.skipped) == (value, 21)
 
 
-def test_a_copy_of_the_request_is_no_reply_while_it_is_unknown_whether_the_adapter_echoes(
+def test_a_copy_of_a_request_is_no_reply_while_it_may_be_an_echo(
     line: LineDriver,
 ) -> None:
     found = exchanged(line, confirmation(), WRITE)
     assert (found.result, found.raw) == (Failure.MAYBE_ECHO, confirmation())
-    found = exchanged(line, confirmation() + confirmation(), WRITE)  # two copies: the adapter echoes
+    found = exchanged(line, confirmation() + confirmation(), WRITE)  # two copies, so the adapter echoes
     assert (found.result, found.skipped) == (8, 8)
     assert exchanged(line, confirmation(), WRITE).result == Failure.NO_REPLY
 
@@ -693,7 +696,7 @@ def test_an_echo_without_a_reply_shows_that_the_adapter_echoes(line: LineDriver)
 
 
 def test_a_delixi_value_of_0_is_found_after_the_echo_of_its_query(line: LineDriver) -> None:
-    """A query's echo equals a reply with the value 0. A state query has no such reply: it shows the echo."""
+    """A query's echo equals a reply with the value 0. A state query has no such reply, and shows the echo."""
     state, ask_state = b":010300030000000007\r\n", b":010300000000000004\r\n"
     value, ask_value = b":010701F40000138898\r\n", b":010701F400000000FD\r\n"
     line.begin(exchange(Message(1, 3, 0, data=words(0, 0)), framing=Framing.DELIXI))
@@ -780,7 +783,7 @@ def make_steady(line: LineDriver, peer: Peer) -> None:
 
 
 def receive_at_pace(line: LineDriver, begin: int, frame: bytes) -> None:
-    """At each read, pass to the line the characters that have arrived by then, until the exchange ends."""
+    """Let the frame's characters arrive one by one from `begin` on, until the exchange ends."""
     came = 0
     while (want := line.want) != "done":
         there = min(max(0, (line.now - begin) // CHARACTER), len(frame))
@@ -795,8 +798,10 @@ def receive_at_pace(line: LineDriver, begin: int, frame: bytes) -> None:
             line.now = line.wake
 
 
-def test_a_paced_value_of_0_ends_the_exchange_of_a_steady_drive(line: LineDriver, steady: Peer) -> None:
-    """An echo would have ended before the last character of the reply."""
+def test_a_delixi_value_of_0_ends_the_exchange_if_it_comes_when_a_reply_is_due(
+    line: LineDriver, steady: Peer
+) -> None:
+    """An echo would have come earlier, so this copy of the request is the reply."""
     make_steady(line, steady)
     for _ in range(5):
         end = send_query(line, steady)
@@ -806,10 +811,10 @@ def test_a_paced_value_of_0_ends_the_exchange_of_a_steady_drive(line: LineDriver
 
 
 @pytest.mark.parametrize("insists", [False, True])
-def test_a_copy_that_may_be_an_echo_waits_for_the_whole_time_out(
+def test_the_line_waits_until_the_timeout_after_a_copy_that_may_be_an_echo(
     line: LineDriver, steady: Peer, insists: bool
 ) -> None:
-    """The copy arrived earlier than a reply can, or the read has `insists`, and ignores arrival times."""
+    """The copy came too early for a reply, or the read has `insists`, which ignores arrival times."""
     make_steady(line, steady)
     end = send_query(line, steady, insists=insists)
     if insists:

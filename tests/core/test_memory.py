@@ -1,4 +1,4 @@
-"""The places in memory of the structs that the core uses in every exchange."""
+"""Addresses of the C structs that the core uses in every exchange."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def new_chunk(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(memory, "_chunks", memory.Chunks())
 
 
-def test_structs_made_together_are_adjacent_in_whole_cache_lines() -> None:
+def test_structs_created_one_after_another_are_adjacent_in_memory() -> None:
     first, second = new_drive(1), new_drive(2)
     block = new_beside("struct md_block", {"count": 3})
     assert place(first) % CACHE_LINE == 0
@@ -79,7 +79,7 @@ def test_a_signal_handler_gets_separate_memory() -> None:
     assert numbers(before, made, after) == [1, 2, 3]
 
 
-def test_a_struct_larger_than_a_chunk_has_room(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_struct_larger_than_a_chunk_of_memory_can_be_created(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(memory, "CHUNK", CACHE_LINE)
     assert numbers(*map(new_drive, range(3))) == [0, 1, 2]
 
@@ -91,7 +91,7 @@ def last_line(struct: str, *fields: str) -> int:
     return -(-end // CACHE_LINE)
 
 
-def test_the_fields_that_every_exchange_uses_are_in_few_cache_lines() -> None:
+def test_the_fields_used_by_every_exchange_are_in_five_cache_lines() -> None:
     """Two cache lines of the drive, two of the exchange, and one of the next exchange's drive."""
     assert last_line("md_drive", "most_timeout_ns", "ready_ns", "failures", "owed_count", "is_doubted") == 1
     assert last_line("md_drive", "counters", "answered_ns") == 2
@@ -100,7 +100,7 @@ def test_the_fields_that_every_exchange_uses_are_in_few_cache_lines() -> None:
 
 
 def test_polled_exchanges_of_a_drive_are_adjacent() -> None:
-    """Proofs, and exchanges outside of a poll, are elsewhere in memory."""
+    """Exchanges that are not polled may be anywhere in memory."""
     peer = Peer(least_timeout=0.02, most_timeout=1.0)
     peer.prove_by([read_of(peer, None), read_of(peer, None)])
     rows = RowLayout(0, [Field(0, NumberFormat.U16, 0, 1, 1)])

@@ -1,4 +1,4 @@
-"""Mastership: a deadline of CLOCK_BOOTTIME; the kernel kills a process that was suspended beyond it."""
+"""Mastership: a deadline on CLOCK_BOOTTIME. If the process is suspended beyond it, the kernel kills it."""
 
 from __future__ import annotations
 
@@ -135,18 +135,18 @@ def test_a_deadline_beyond_the_range_of_the_clock_raises() -> None:
 
 
 @table("wrong", [0, -1, float("nan"), float("inf"), 3601])
-def test_a_guard_out_of_range_raises(wrong: float) -> None:
+def test_a_guard_time_out_of_range_raises(wrong: float) -> None:
     with pytest.raises(ValueError, match=r"^guard_s = .* must be above 0 and at most 3600, in s$"):
         Mastership(wrong)
 
 
-def test_a_guard_that_is_not_a_number_raises() -> None:
+def test_a_guard_time_that_is_not_a_number_raises() -> None:
     with pytest.raises(TypeError, match=r"^guard_s is a number of seconds, not '1'$"):
         Mastership("1")  # type: ignore[arg-type]
 
 
 @pytest.mark.slow
-def test_the_kernel_kills_a_stopped_process_half_a_guard_after_its_deadline() -> None:
+def test_the_kernel_kills_a_suspended_process_half_a_guard_time_after_its_deadline() -> None:
     with keeper(0.4, 0.3) as process:
         until_ns = until_of(process)
         process.send_signal(signal.SIGSTOP)
@@ -155,7 +155,7 @@ def test_the_kernel_kills_a_stopped_process_half_a_guard_after_its_deadline() ->
 
 
 @pytest.mark.slow
-def test_a_process_that_extends_in_time_lives() -> None:
+def test_a_process_that_extends_its_mastership_in_time_is_not_killed() -> None:
     then = (
         "for n in range(40):\n"
         " mastership.extend(time.clock_gettime_ns(time.CLOCK_BOOTTIME) + 4 * 10**9)\n"
@@ -176,7 +176,7 @@ def test_a_process_that_ended_its_mastership_is_not_killed(end: str) -> None:
         assert process.poll() is None
 
 
-def test_a_forked_child_is_not_master() -> None:
+def test_a_forked_child_does_not_hold_its_parents_mastership() -> None:
     mastership = Mastership()
     mastership.extend(now_ns() + 100 * S)
     if (child := os.fork()) == 0:

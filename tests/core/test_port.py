@@ -91,7 +91,7 @@ def test_every_byte_value_passes_unchanged() -> None:
         os.close(master)
 
 
-def test_parity_errors_are_dropped(pty: int) -> None:
+def test_bytes_with_parity_errors_are_dropped(pty: int) -> None:
     set_settings(pty, 9600, "8E1")
     assert termios.tcgetattr(pty)[0] == termios.INPCK | termios.IGNPAR
 
@@ -122,7 +122,7 @@ def test_ports_opened_concurrently_share_one_thread(monkeypatch: pytest.MonkeyPa
         started.append(f"engine {len(started)}")
         if len(started) > 1:
             is_second.set()
-        is_second.wait(0.5)  # without the lock, a second port would start a thread now
+        is_second.wait(0.5)  # time in which a second port would start a thread if it did not wait
         return started[0]
 
     monkeypatch.setattr(port_module, "lib", SimpleNamespace(md_engine_start=start))

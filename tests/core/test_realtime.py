@@ -56,7 +56,7 @@ def test_only_the_cores_thread_is_scheduled_in_real_time(realtime: Realtime) -> 
     assert policies()[core] & os.SCHED_FIFO
     second.want(False)
     assert not policies()[core] & os.SCHED_FIFO
-    assert not second.has_ended()  # realtime scheduling was ended by a client, not by the core
+    assert not second.has_ended()  # the client switched realtime scheduling off, not the core
 
 
 def locked_kb() -> int:
@@ -65,7 +65,7 @@ def locked_kb() -> int:
 
 
 def test_the_cores_code_is_locked_in_memory(realtime: Realtime) -> None:
-    assert 64 < locked_kb() < 4096  # kB: the size of a library, not of the whole process
+    assert 64 < locked_kb() < 4096  # kB: the core's library, but not the whole process
     realtime.want(False)
     assert locked_kb() == 0
 
@@ -128,7 +128,7 @@ def test_a_flooded_port_ends_realtime_scheduling(
 
 
 @pytest.mark.parametrize("how", ["plant file", "argument"])
-def test_a_plant_or_an_argument_asks_for_realtime(
+def test_realtime_scheduling_is_requested_by_a_plant_file_or_an_argument(
     how: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[bool] = []
@@ -143,13 +143,15 @@ def test_a_plant_or_an_argument_asks_for_realtime(
     assert asked[-2:] == [True, False]
 
 
-def test_wake_ups_are_measured() -> None:
+def test_wake_lateness_measures_how_late_the_core_wakes() -> None:
     late = wake_lateness(0.02, realtime=False)
     assert len(late) == 10
     assert all(each >= 0 for each in late)
 
 
-def test_only_the_first_and_the_last_client_switch_realtime(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_the_first_and_the_last_client_switch_realtime_scheduling(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """A thread that has ended realtime by itself must not start it again for a second client."""
     switched: list[bool] = []
 

@@ -49,7 +49,7 @@ OTHER = Message(1, 0x03, 0x11, 1)
 SILENT = Message(2, 0x03, 0x10, 1)
 TIMEOUT_S = 0.02
 Ends = tuple[socket.socket, socket.socket]
-SO_PEEK_OFF = 42  # of Linux: each peek continues where the last one ended
+SO_PEEK_OFF = 42  # Linux's number; with it, each peek continues after the last one
 
 
 @pytest.fixture
@@ -70,7 +70,7 @@ def port(ends: Ends) -> Iterator[Port]:
 
 @pytest.fixture
 def free_port() -> Iterator[Port]:
-    """Return the port of an adapter that takes every frame and never replies: a pty counts no bytes."""
+    """Return the port of an adapter that takes each frame and never replies: a pty, which counts no bytes."""
     far_end, terminal = os.openpty()
     os.set_blocking(terminal, False)
     made = Port(terminal, must_take=0)
@@ -141,7 +141,7 @@ class Device:
                 self._adapter.recv(8)
 
 
-def test_a_stop_is_written_behind_held_bytes_but_a_command_is_not(ends: Ends, port: Port) -> None:
+def test_a_stop_is_written_to_a_stalled_adapter_but_another_command_is_not(ends: Ends, port: Port) -> None:
     assert port.carry_out(exchange(READ)).result == Failure.NO_REPLY
     assert port.is_stalled
     start = port.carry_out(exchange(START))
@@ -164,11 +164,11 @@ def test_a_stop_during_a_stall_is_sent_after_at_most_one_read(ends: Ends, port: 
     assert taken(ends[1]) == [frame(READ), frame(STOP)]
 
 
-def test_a_stop_does_not_wait_for_a_read_that_waits_for_the_adapter(ends: Ends, port: Port) -> None:
+def test_a_stop_does_not_wait_for_a_read_that_waits_for_a_stalled_adapter(ends: Ends, port: Port) -> None:
     """The read is sent after the stop, once the adapter has taken the stop and the earlier read."""
     assert port.carry_out(exchange(READ)).result == Failure.NO_REPLY
     port.submit([exchange(OTHER)] + [exchange(OTHER, timeout=0.2)] * 64, [0] * 65)
-    until(lambda: port.done > 0)  # the first read was not sent; the turn of the second read starts
+    until(lambda: port.done > 0)  # the first read was not sent; now the second one waits
     assert port.carry_out(exchange(STOP, insists=True)).sent_ns > 0
     assert taken(ends[1]) == [frame(READ), frame(STOP)]
     select.select([ends[1]], [], [])
@@ -205,14 +205,14 @@ def test_a_reply_after_a_stall_is_not_taken_for_the_reply_to_the_next_read(ends:
         assert answering.result() == frame(OTHER)
 
 
-def test_the_end_of_polling_does_not_wait_for_a_read_that_waits_for_the_adapter(port: Port) -> None:
+def test_polling_ends_without_waiting_for_a_read_on_a_stalled_adapter(port: Port) -> None:
     assert port.carry_out(exchange(READ)).result == Failure.NO_REPLY
     port.submit([exchange(READ), exchange(READ, timeout=30.0)], [0, 0])
-    until(lambda: port.done > 0)  # the first read was not sent; the turn of the second read starts
+    until(lambda: port.done > 0)  # the first read was not sent; now the second one waits
     assert not port.end()
 
 
-def test_a_broadcast_command_is_not_written_behind_held_bytes(port: Port) -> None:
+def test_a_broadcast_command_is_not_written_to_a_stalled_adapter(port: Port) -> None:
     assert port.carry_out(exchange(READ)).result == Failure.NO_REPLY
     held = port.carry_out(exchange(SET_ALL))
     assert (held.result, held.error, held.sent_ns) == (Failure.LINE_LOST, errno.ETIMEDOUT, 0)
@@ -226,7 +226,7 @@ def test_a_broadcast_command_does_not_wait_for_late_replies(free_port: Port) -> 
     assert free_port.carry_out(set_all).sent_ns > 0
 
 
-def test_the_port_counts_as_lost_if_a_command_is_held_until_its_timeout(port: Port) -> None:
+def test_a_port_is_lost_if_its_adapter_holds_a_command_until_the_timeout(port: Port) -> None:
     start = port.carry_out(exchange(START))
     assert (start.result, start.error) == (Failure.LINE_LOST, errno.ETIMEDOUT)
     assert start.sent_ns > 0
@@ -238,7 +238,7 @@ def test_a_command_that_the_adapter_has_accepted_does_not_lose_the_port(free_por
     assert (free_port.is_stalled, free_port.lost, free_port.called_off) == (False, False, False)
 
 
-def test_a_reply_ends_a_stall(ends: Ends, port: Port) -> None:
+def test_a_reply_ends_the_stall_of_an_adapter(ends: Ends, port: Port) -> None:
     assert port.carry_out(exchange(READ)).result == Failure.NO_REPLY
     ends[1].recv(4096)
     with Device(ends[1]):
@@ -247,7 +247,7 @@ def test_a_reply_ends_a_stall(ends: Ends, port: Port) -> None:
     assert not port.is_stalled
 
 
-def test_closing_calls_off_a_command_in_flight(ends: Ends, port: Port) -> None:
+def test_closing_a_port_cancels_a_command_in_flight(ends: Ends, port: Port) -> None:
     found: list[Completion] = []
     caller = threading.Thread(target=lambda: found.append(port.carry_out(exchange(START, timeout=30.0))))
     caller.start()
@@ -292,7 +292,7 @@ def test_a_silent_drive_does_not_delay_others_although_the_driver_miscounts_unse
 
 
 @pytest.mark.parametrize(("failures", "was_wrong", "seconds"), [(0, 0, 30), (1, 0, 40), (0, 1, 1), (1, 1, 1)])
-def test_after_a_long_stall_a_drive_that_answered_is_read_first(
+def test_after_a_long_stall_an_answering_drive_is_read_first(
     failures: int, was_wrong: int, seconds: int
 ) -> None:
     peer, line = Peer(least_timeout=1, most_timeout=1), LineDriver()

@@ -1,4 +1,4 @@
-"""Modbus TCP: frames from documents and pymodbus, and exchanges on a clock that the test sets."""
+"""Modbus TCP: frames from documents and from pymodbus, and exchanges on a simulated clock."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from multidrop.core import (
 
 TCP = Framing.TCP
 NUMBER = 400  # random frames
-EXCEPTION = 9  # bytes of an exception, with any length in its header
+EXCEPTION = 9  # bytes of an exception frame, whatever its header states
 
 # As printed: in the messaging guide for TCP/IP V1.0b, 4.4.2 (read one register of unit FF), and in a panel
 # meter's manual (write one register, and its reply).
@@ -65,7 +65,7 @@ def test_printed_tcp_frames_are_built_and_parsed() -> None:
 
 @table("replies", [False, True])
 def test_a_tcp_frame_is_parsed_like_the_rtu_frame_with_the_same_body(replies: bool) -> None:
-    """Whole and damaged frames are tested. TCP's header shows a wrong length sooner; all else is the same."""
+    """Whole and damaged frames are tested. Only a wrong length is found earlier, by the TCP header."""
     seen = set()
     for number, said in enumerate(frames(11, Framing.RTU, NUMBER, replies=replies)):
         if said.damage in ("flipped on the line", "cut off", "followed") or len(said.frame) < 4:
@@ -191,7 +191,7 @@ def test_each_request_has_a_new_transaction_id(line: LineDriver, drive: Peer) ->
     assert len(seen) == 300
 
 
-def test_modbus_tcp_keeps_no_silence(line: LineDriver, drive: Peer) -> None:
+def test_modbus_tcp_has_no_silence_between_frames(line: LineDriver, drive: Peer) -> None:
     for _ in range(3):
         began = line.now
         line.receive(value(ask(line, drive), 7))
@@ -200,7 +200,7 @@ def test_modbus_tcp_keeps_no_silence(line: LineDriver, drive: Peer) -> None:
 
 
 @pytest.mark.parametrize("piece", [1, 2, 5, 7, 4096])
-def test_a_reply_may_come_in_pieces(line: LineDriver, drive: Peer, piece: int) -> None:
+def test_a_modbus_tcp_reply_may_come_in_pieces(line: LineDriver, drive: Peer, piece: int) -> None:
     line.receive(value(ask(line, drive), 7), piece)
     assert (line.want, line.completion.reply.data) == ("done", words(7))
 
@@ -252,9 +252,9 @@ def test_a_request_is_sent_immediately_although_a_late_reply_is_due(line: LineDr
     assert drive.late_until_ns == 0
 
 
-def test_the_lateness_of_a_reply_is_learnt_to_the_nanosecond(line: LineDriver, drive: Peer) -> None:
+def test_the_timeout_adapts_to_the_delay_of_a_late_tcp_reply(line: LineDriver, drive: Peer) -> None:
     late = miss(line, drive)
-    sent = line.completion.sent_ns + 8 * CHARACTER  # the duration on the serial wire behind the gateway
+    sent = line.completion.sent_ns + 8 * CHARACTER  # plus the time on the serial line behind the gateway
     for _ in range(30):
         miss(line, drive)
     line.now = sent + 2000 * MS
@@ -265,7 +265,7 @@ def test_the_lateness_of_a_reply_is_learnt_to_the_nanosecond(line: LineDriver, d
 
 
 @pytest.mark.parametrize("code", [0x0A, 0x0B])
-def test_a_gateways_exception_for_a_silent_drive_is_not_the_drives_reply(
+def test_a_gateways_exception_for_a_silent_drive_counts_as_no_reply(
     line: LineDriver, drive: Peer, code: int
 ) -> None:
     for number in (1, 2):
@@ -295,7 +295,7 @@ def test_a_gateways_late_exception_is_not_counted_as_a_late_reply(line: LineDriv
         (bytes([1, 3, 2, 0, 7, 0]), FrameFault.BAD_LENGTH),
     ],
 )
-def test_a_wrong_reply_with_the_right_id_ends_at_the_timeout(
+def test_an_exchange_with_a_wrong_reply_of_its_id_ends_at_the_timeout(
     line: LineDriver, drive: Peer, body: bytes, result: FrameFault
 ) -> None:
     transaction = ask(line, drive)
@@ -462,14 +462,18 @@ def gateway() -> LineDriver:
     return LineDriver(Transactions.IGNORED)
 
 
-def test_with_ids_ignored_a_reply_with_another_id_is_accepted(gateway: LineDriver, drive: Peer) -> None:
+def test_if_transaction_ids_are_ignored_a_reply_with_another_id_is_accepted(
+    gateway: LineDriver, drive: Peer
+) -> None:
     for raw in range(10):
         line = gateway
         line.receive(value((ask(line, drive) + 1) & 0xFFFF, raw))
         assert (line.want, line.completion.reply.data) == ("done", words(raw))
 
 
-def test_with_ids_ignored_a_late_reply_delays_the_next_request(gateway: LineDriver, drive: Peer) -> None:
+def test_if_transaction_ids_are_ignored_a_late_reply_delays_the_next_request(
+    gateway: LineDriver, drive: Peer
+) -> None:
     miss(gateway, drive)
     gateway.begin(exchange(READ, drive))
     assert gateway.completion.result == Failure.LATE_ANSWER_DUE
@@ -481,7 +485,7 @@ def test_with_ids_ignored_a_late_reply_delays_the_next_request(gateway: LineDriv
     assert gateway.completion.reply.data == words(2)
 
 
-def test_with_ids_ignored_a_drive_may_reply_after_a_gateways_exception(
+def test_if_ids_are_ignored_a_drive_may_reply_after_a_gateways_exception(
     gateway: LineDriver, drive: Peer
 ) -> None:
     gateway.receive(tcp(ask(gateway, drive), bytes([1, 0x83, 0x0B])))
