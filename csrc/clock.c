@@ -2,7 +2,7 @@
 #include "internal.h"
 
 enum {
-    WRONG_NS = 100000, /* replace the stored offset if its error is larger */
+    WRONG_NS = 100000, /* ns; replace the stored offset between the clocks if its error is larger */
     MOST_TRIES = 4     /* attempts to read both clocks without an interruption in between */
 };
 

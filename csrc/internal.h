@@ -42,7 +42,7 @@ void md_row_queue_add(struct md_row_queue *row_queue, const struct md_block *blo
 
 /* ---- body.c: the content of frames, from the address on ---- */
 
-enum { MD_MOST_BODY = 253 }; /* a reply with 125 registers; the standard has room for 254 bytes */
+enum { MD_MOST_BODY = 253 }; /* body of a reply with 125 registers; the standard allows 254 bytes */
 
 /* Return the length of a body: of a request if `request` is NULL, otherwise of the reply to `request`. Return
  * MD_INCOMPLETE while the first bytes do not determine the length. */

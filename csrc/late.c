@@ -180,7 +180,8 @@ static void note_late_proof(struct md_drive *drive, const struct md_owed *owed)
 
 /* ---- outstanding requests of a drive ---- */
 
-static const int64_t FORGET_NS = INT64_C(120000000000); /* no network delays bytes by 2 minutes */
+/* ns; older requests are forgotten, because no network delays bytes by 2 minutes */
+static const int64_t FORGET_NS = INT64_C(120000000000);
 
 /* Return the drive's outstanding request that is the same as the exchange's request; NULL: none. */
 static struct md_owed *find_same(struct md_drive *drive, const struct md_exchange *exchange)

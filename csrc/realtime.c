@@ -21,7 +21,7 @@ enum {
     PRIORITY = 1,    /* the lowest of SCHED_FIFO, so that the threads of drivers come first */
     STACK = 64 << 10 /* bytes of the thread's stack to lock in memory */
 };
-static const int64_t CHECK_NS = 500000000; /* time between two checks */
+static const int64_t CHECK_NS = 500000000; /* ns; time between two checks of the thread's CPU time */
 /* This limit is long, because a virtual machine's pause may count as the thread's CPU time. */
 static const int64_t MOST_CPU_NS = 10000000000;
 

@@ -143,8 +143,8 @@ int64_t md_learn_delay(const struct md_exchange *exchange, int64_t delay_ns, int
     return delay_ns;
 }
 
-/* Add half of the delay, because delays vary. If the request was sent several times, it is unknown which one
- * the reply answers. */
+/* The longer timeout is 1.5 times the late reply's delay, because delays vary. If the request was sent
+ * several times, it is unknown which one the reply answers. */
 void md_learn_lateness(struct md_drive *drive, int64_t delay_ns, int is_exact)
 {
     int64_t patience_ns = sooner(delay_ns + delay_ns / 2, MOST_PATIENCE);
@@ -161,7 +161,7 @@ void md_learn_silence(struct md_drive *drive)
 
 /* Counters only grow, so the counts of a time span are the difference of two readings. Response delays are
  * counted in buckets, PARTS for each doubling of the delay. */
-enum { FIRST_DOUBLING = 16, PARTS = 8, PART_BITS = 3 }; /* the second bucket starts near 2^16 ns */
+enum { FIRST_DOUBLING = 16, PARTS = 8, PART_BITS = 3 }; /* the second bucket of delays starts near 2^16 ns */
 enum { NAK = 7, BUSY = 6 };                                /* Modbus exception codes */
 
 _Static_assert(MD_STATUSES == 1 - MD_STALLED, "every status has a place");

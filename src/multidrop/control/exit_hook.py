@@ -28,7 +28,7 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 IMPATIENT = 3  # this many signals within a second end the wait for the stops
 HANDLING_S = 0.05  # s; longest delay in handling a signal that the kernel gave to another thread
 PACKAGE = __name__.partition(".")[0]
-MOST_NAMES = 20  # limit of drives named in a message
+MOST_NAMES = 20  # limit of the drives that a message names
 CUT_SHORT = "the stops were cut short by a third signal: motors may still be turning"
 REPLACED = (
     "%s will not stop the drives: the program has set its own handler since. They are stopped when the bus "

@@ -52,7 +52,7 @@ def start_staggered(drives: Sequence[Drive], gap: float, direction: Direction | 
 
 
 def _is_safe_to_stop(drive: Drive, call: Call | None) -> bool:
-    """Return True if a write was sent to the drive, or if its identity is known on its present bus."""
+    """Return False if no write was sent to the drive, and its present bus does not know its identity."""
     if call is None or call.sent:
         return True
     try:

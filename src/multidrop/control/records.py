@@ -201,7 +201,7 @@ def _spelt(given: object) -> str:
 CALLED = "called"  # outcome in the record of a write or a stop that is about to be sent
 REFUSED = "refused"  # outcome in the record of a write that was not sent
 CALLED_S = 0.05  # s; longest time that a stop waits until its audit record is written
-CLOSING_NS = 1_000_000_000  # longest time that closing waits for other threads' records
+CLOSING_NS = 1_000_000_000  # longest time that closing the audit log waits for records of other threads
 
 _log = logging.getLogger("multidrop.control")
 _audit_thread = AsideThread("multidrop audit")

@@ -39,14 +39,16 @@ from multidrop.transport.aside_log import log_aside
 from multidrop.transport.exchange import WRITE_TIMEOUT, Exchanges
 
 LEAST_S = 30.0  # s; how long a stop is repeated by default
-PAUSE_S = 0.2  # s; pause before a repetition
-AT_ONCE = 8  # after this many steps without a good reply, the stop shares the line with polling
-SHARE = 1.5  # after a step without a good reply, polling gets this multiple of the step's duration
-MOST_STEPS = 8  # limit of the script's steps when a stop is sent again after an interruption
+PAUSE_S = 0.2  # s; pause before a stop is repeated
+AT_ONCE = 8  # after this many steps without a good reply, a stop shares the line with polling
+# after a stop's step without a good reply, polling has the line for this multiple of the step's duration
+SHARE = 1.5
+MOST_STEPS = 8  # limit of the steps of its script if a stop is sent again after an interruption
 UNSENT = (WriteForbidden, LineError, NotMaster, ValueError)
 WORTH_REPEATING = (Unconfirmed, NotVerified, NoReply, BadReply, DriveException, PortLost, NotMaster)
 UNANSWERED = (Unconfirmed, NoReply, BadReply)
-NO_ROOM = (MemoryError, OSError)  # retried: the system may soon have memory or descriptors again
+# errors after which stops are retried: the system may soon have memory or descriptors again
+NO_ROOM = (MemoryError, OSError)
 REGAIN_NS = 500_000_000  # interval at which stops try to reopen a lost port
 
 _log = logging.getLogger("multidrop.control")

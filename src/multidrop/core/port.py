@@ -23,7 +23,7 @@ from multidrop.core.process import only_here, register_at_fork
 
 CHUNK_ROWS = 1 << 12
 WAKE_PERIOD_S = 2e-3  # s; duration of each sleep in `wake_lateness`
-MOST_CHUNKS = 256  # when all chunks are full, the queue drops new rows and counts them
+MOST_CHUNKS = 256  # limit of the chunks of rows; when all are full, the queue drops new rows and counts them
 
 
 class RowQueue:
@@ -131,7 +131,7 @@ class TransactionIds(StrEnum):
 class Transactions(IntEnum):
     """How a port uses transaction ids (enum md_transactions)."""
 
-    NONE = lib.MD_NO_TRANSACTIONS  # every framing except Modbus TCP
+    NONE = lib.MD_NO_TRANSACTIONS  # no transaction ids: every framing except Modbus TCP
     MATCHED = lib.MD_MATCHED  # a reply has the id of its request; replies with other ids are late or foreign
     IGNORED = lib.MD_IGNORED  # a gateway replies with its own ids
 

@@ -32,7 +32,7 @@ COMMENT, OUTAGE, TRIGGER = "comment", "outage", "trigger"  # kinds of events
 INPUT_OLD = status_code("input too old")
 SAVE_NS = 10_000_000_000  # interval between writes of the file that keeps the channels' totals
 LONGEST_TEXT = 500  # limit of an event's text, in characters
-CLOSE_S = 2.0  # how long the end of polling waits for the disk
+CLOSE_S = 2.0  # s; longest wait for the disk when polling ends
 MOST_BYTES = 1 << 26  # limit of the size of the file that keeps the channels' totals
 
 _log = logging.getLogger("multidrop.polling")

@@ -84,7 +84,7 @@ class JobMaker:
         self._made: dict[tuple[Drive, Block, int | None], PolledJob] = {}
         # A layout counts the refusals of its block, so jobs that read a block at different rates share it.
         self._rows: dict[tuple[Drive, Block], RowLayout] = {}
-        self._skipped = 0  # number of slots that were skipped by jobs which are forgotten now
+        self._skipped = 0  # number of polls that were skipped by jobs which are forgotten now
 
     def plan(self, polled: PolledDrive, delay: float) -> PlannedJobs:
         """Plan the requests that poll a drive, for a response delay of `delay` s; return their jobs.

@@ -23,8 +23,8 @@ from multidrop.transport import clock
 from multidrop.transport.open_port import check_port
 
 OPENING = 32  # limit of ports that are opened concurrently
-ENDING_NS = 1_000_000_000  # how long to wait for in-flight exchanges
-NO_LINE = 0  # reserved; no line has this number
+ENDING_NS = 1_000_000_000  # how long the end of polling waits for in-flight exchanges
+NO_LINE = 0  # a number that no line has
 MOST_LINES = (1 << 16) - 1  # the highest line number of a row queue
 
 

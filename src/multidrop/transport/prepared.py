@@ -115,7 +115,7 @@ class PreparedRead:
         self.spare: list[Completion] = []  # completions that later reads reuse
 
     def insisting(self, drive: Drive, timeout: float) -> Exchange:
-        """Return an exchange that reads the same block with `insists` and this timeout in s; see Exchange."""
+        """Return an exchange that reads the block without waiting for late replies; `timeout` is in s."""
         peer, values = self.exchange.peer, self.exchange.values
         return make_read(drive, self.block, peer, values=values, insists=True, timeout=timeout)
 
