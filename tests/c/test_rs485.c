@@ -280,7 +280,7 @@ static void check_driver(void)
         uart.flags = rows[i].before;
         CHECK(md_rs485_begin(port, MD_RS485_KERNEL, 0) == rows[i].result);
         CHECK(uart.flags == rows[i].after);
-        CHECK(md_rs485_write(port, frame, 8) == 8 && uart.changes == 0); /* the driver switches RTS */
+        CHECK(md_rs485_write(port, frame, 8) == 8 && uart.changes == 0); /* RTS is left to the driver */
         row = "";
     }
 }

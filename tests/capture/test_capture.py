@@ -270,7 +270,7 @@ def plant(*drives: Toy) -> Plant:
     return Plant([PlantLine("hall", "pty", drives=[PolledDrive(drive) for drive in drives])])
 
 
-def test_registers_have_the_captured_values_at_the_captured_times(capture: Path) -> None:
+def test_replayed_registers_have_the_captured_values_at_their_times(capture: Path) -> None:
     drive = Replay(capture, plant(Toy(1))).drive(Toy(1))
     assert drive["output_frequency"] == 10.0
     start = 1000.0  # the time of the first request
@@ -279,7 +279,7 @@ def test_registers_have_the_captured_values_at_the_captured_times(capture: Path)
     assert frequencies == [10.0, 10.0, None, None, 25.0, 25.0, 30.0, 30.0]
 
 
-def test_a_written_value_lasts_until_the_next_captured_value(capture: Path) -> None:
+def test_a_write_to_a_replayed_drive_lasts_until_the_next_captured_value(capture: Path) -> None:
     drive = Replay(capture, plant(Toy(1))).drive(Toy(1))
     drive.answer(READ_REQUEST, 0.0)
     drive["output_frequency"] = 5.0
@@ -290,12 +290,12 @@ def test_a_written_value_lasts_until_the_next_captured_value(capture: Path) -> N
     assert drive["output_frequency"] == 25.0
 
 
-def test_a_drive_that_was_not_captured_is_silent(capture: Path) -> None:
+def test_replay_of_a_drive_that_was_not_captured_is_silent(capture: Path) -> None:
     replay = Replay(capture, plant(Toy(1), Toy(2, name="other")))
     assert replay.drive(Toy(2, name="other")).answer(Message(2, 3, 1, 1), 0.0) is None
 
 
-def test_a_capture_of_other_drives_is_refused(capture: Path) -> None:
+def test_replay_refuses_a_capture_of_other_drives(capture: Path) -> None:
     with pytest.raises(ValueError, match=r"hall\.pcapng has no exchange with other$"):
         Replay(capture, plant(Toy(2, name="other")))
 
@@ -411,12 +411,12 @@ def described(*options: tuple[int, bytes]) -> bytes:
     return section + struct.pack("<II", 1, size) + interface + struct.pack("<I", size)
 
 
-def test_an_empty_resolution_option_is_read_as_the_default(tmp_path: Path) -> None:
+def test_an_empty_time_resolution_option_of_pcapng_means_the_default(tmp_path: Path) -> None:
     (tmp_path / "a.pcapng").write_bytes(described((9, b"")))
     assert spans(tmp_path / "a.pcapng") == {"a-0": []}
 
 
-def test_a_clock_with_a_huge_offset_is_refused(tmp_path: Path) -> None:
+def test_a_capture_with_a_huge_time_offset_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.pcapng").write_bytes(described((14, struct.pack("<q", 1 << 40))))
     with pytest.raises(CaptureError, match=r"byte 28: its time offset of 1099511627776 s is too large"):
         spans(tmp_path / "a.pcapng")

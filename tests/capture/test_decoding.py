@@ -49,7 +49,7 @@ EXCHANGES = [  # model, framing, request and reply as printed in manuals, regist
 
 
 @pytest.mark.parametrize(("model", "framing", "request_", "register", "value"), EXCHANGES)
-def test_an_exchange_is_a_row_in_engineering_units(
+def test_a_captured_exchange_is_decoded_to_engineering_units(
     tmp_path: Path, model: str, framing: str, request_: str, register: str, value: float
 ) -> None:
     texts = (request_, f":{request_}\\r\\n")
@@ -63,7 +63,7 @@ def _text(frame: bytes) -> str:
     return frame.decode().replace("\r\n", "\\r\\n") if frame[:1] == b":" else frame.hex(" ").upper()
 
 
-def test_each_register_of_a_block_gets_its_own_row(tmp_path: Path) -> None:
+def test_each_register_of_a_captured_block_read_has_its_own_row(tmp_path: Path) -> None:
     exchange = next(
         each for each in RTU if _text(each.request_frame) == "01 10 00 0C 00 02 04 00 C8 01 90 73 F8"
     )
@@ -102,7 +102,7 @@ def test_an_unanswered_request_is_a_row_with_the_reason_as_status(tmp_path: Path
 
 
 @pytest.mark.long
-def test_names_beyond_the_limit_of_a_batch_start_another_batch(tmp_path: Path) -> None:
+def test_register_names_beyond_the_batch_limit_start_another_batch(tmp_path: Path) -> None:
     """All 65536 holding registers are read, and then some input registers."""
     ends = {3: 65500, 4: 10_000}
     with CaptureWriter(tmp_path / "a.pcapng") as capture:
@@ -167,7 +167,7 @@ def test_a_request_for_too_many_registers_is_decoded_to_at_most_125_rows(tmp_pat
 @pytest.mark.parametrize(
     ("reply", "end"), [(Message(1, 3, 0, 100, bytes(200)), (0, "ok")), (None, (None, "no reply"))]
 )
-def test_rows_beyond_the_limit_of_a_batch_start_another_batch(
+def test_decoded_rows_beyond_the_batch_limit_start_another_batch(
     tmp_path: Path, reply: Message | None, end: tuple[float | None, str]
 ) -> None:
     """The rows of one exchange are never divided between two batches."""

@@ -69,7 +69,7 @@ static void check_reply(int framing, const uint8_t *bytes, size_t len, const str
     must(md_parse_reply(framing, bytes, len, request, &found) == used && found.data_len <= MD_MOST_DATA);
     must(request->address > 0 || framing == MD_TCP);
     must(found.address == request->address && found.function == request->function);
-    must(found.exception || (used >= md_reply_length(framing, request) && /* equal for most functions */
+    must(found.exception || (used >= md_reply_length(framing, request) && /* usually equal */
                              used <= md_longest_reply(framing, request)));
     if (md_build_request(framing, request, asked, sizeof asked) < 0)
         return; /* the core would not send this request */

@@ -31,7 +31,8 @@ struct scene {
     int number; /* number of the exchange */
     int64_t now, begun, ends; /* present time; start of the exchange; its latest end */
     int64_t last_heard, silence; /* last activity on the line, and the silence required after it */
-    /* numbers of received bytes: before the exchange; in it before its request; in it after its request */
+    /* number of bytes received before the exchange, in the exchange before its request, and after its request
+     * */
     size_t left_over, before, after;
     struct answer answers[ANSWERS];
     uint64_t exchanges[DRIVES];
@@ -95,7 +96,8 @@ static void check_completion(void)
     const struct md_exchange *exchange = &scene.exchange;
     size_t used = done->result > 0 ? (size_t)done->result : 0;
     must(done->begun_ns == scene.begun && done->raw_len <= sizeof done->raw);
-    /* Every byte is part of the reply or counted. Bytes received during sending may be the request's echo. */
+    /* Every received byte is part of the accepted reply or counted. Bytes that come during sending may be an
+     * echo. */
     must(done->stale + done->skipped + used == scene.left_over + scene.before + scene.after);
     must(done->skipped + used >= scene.after && done->skipped + used <= scene.after + scene.line.tx_len);
     must((done->sent_ns != 0) == scene.has_asked || done->result == MD_LINE_LOST);
@@ -275,7 +277,7 @@ static void fill_short(struct md_message *reply)
     if (reply->function == 0x16) /* repeats its request */
         return;
     memset(reply->data, 0, reply->data_len);
-    if (reply->function == 0x2B) { /* an identification without objects */
+    if (reply->function == 0x2B) { /* a device identification without objects */
         reply->data[0] = 0x0E;
         reply->data[1] = code;
     }
@@ -451,7 +453,8 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
     return 0;
 }
 
-/* Select noise to become a frame: a request, or the reply to the last exchange that started before it. */
+/* Select bytes of noise, which the mutator replaces by a frame: a request, or a reply to the last exchange
+ * before it. */
 int find_wire(uint8_t *data, size_t size, unsigned seed, struct wire *wire)
 {
     size_t found = 0, at = HEADER, used = 0;

@@ -62,7 +62,8 @@ static int next_frame(struct ear *ear, struct md_span *span, size_t *at)
     return 0;
 }
 
-/* Return the piece whose head is at `at` in the input; `len` bytes follow its head. */
+/* Return the piece whose two head bytes are at position `at` of the input. Set `len` to the number of its
+ * other bytes. */
 static struct md_piece piece_of(const uint8_t *data, size_t size, size_t at, size_t *len)
 {
     static const uint8_t sides[] = {MD_EITHER_SIDE, MD_EITHER_SIDE, MD_EITHER_SIDE, MD_EITHER_SIDE,

@@ -70,7 +70,9 @@ def some(number: int, drive: int = 0) -> object:
     return batch(NAMES, drive, range(number * 20, number * 20 + 20), NOON, SECOND)
 
 
-def test_closing_writes_all_rows(tmp_path: Path, writers: Callable[..., HistoryWriter]) -> None:
+def test_closing_a_history_writer_writes_all_rows(
+    tmp_path: Path, writers: Callable[..., HistoryWriter]
+) -> None:
     writer = writers(tmp_path / "new" / "history")
     taken = [some(number, number % 2) for number in range(50)]
     for one in taken:
@@ -311,7 +313,7 @@ def test_names_of_history_files_have_segment_numbers_and_times() -> None:
     assert file_name(7, 9, 0, 1) == "00000007-00000009.19700101T000000Z-19700101T000001Z.parquet"
 
 
-def test_widest_omits_the_files_whose_rows_a_wider_file_contains() -> None:
+def test_files_whose_segments_are_all_in_a_merged_file_are_omitted() -> None:
     def file(first: int, last: int) -> HistoryFile:
         return HistoryFile(Path(f"{first}-{last}"), first, last, 0, 0)
 

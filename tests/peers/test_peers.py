@@ -185,7 +185,7 @@ def test_the_command_line_can_read_and_write_registers(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["libmodbus tcp", "pymodbus tcp"])
-def test_poll_reads_all_values_of_the_server(name: str, tmp_path: Path) -> None:
+def test_multidrop_poll_reads_all_values_of_another_server(name: str, tmp_path: Path) -> None:
     path = tmp_path / "plant.toml"
     with running(name, tmp_path) as server:
         path.write_text(

@@ -84,12 +84,12 @@ def test_a_register_in_the_metadata_without_rows_is_an_empty_column(tmp_path: Pa
 @pytest.mark.parametrize(
     "about", [{}, {"drives": 3}, {"drives": {"a": 3}}, {"drives": {"a": {"registers": 1}}}]
 )
-def test_any_metadata_is_read_without_an_error(tmp_path: Path, about: dict[str, object]) -> None:
+def test_a_recording_with_invalid_metadata_is_read(tmp_path: Path, about: dict[str, object]) -> None:
     path = record(tmp_path / "run.csv", [row(1, "pump", "output_frequency", 50.0)], about)
     assert pa.table(multidrop.open_recording(path).wide(PUMP)).column(PUMP).to_pylist() == [50.0]
 
 
-def test_a_damaged_recording_raises_its_reader_s_error(tmp_path: Path) -> None:
+def test_tables_of_a_damaged_recording_raise_the_readers_error(tmp_path: Path) -> None:
     path = record(tmp_path / "run.csv", [row(at, "pump", "output_frequency", 50.0) for at in range(4)])
     path.write_text(path.read_text().replace("pump,", "pump;", 1))
     for take, library in (("to_pandas", "pandas"), ("to_polars", "polars"), ("wide", "json")):

@@ -101,7 +101,7 @@ def test_a_file_cut_between_a_dictionary_and_its_batch_is_readable(tmp_path: Pat
         assert polars.read_ipc_stream(path)["drive"].to_list() == expected
 
 
-def test_names_of_a_failed_batch_are_written_with_the_next_batch(tmp_path: Path) -> None:
+def test_names_of_a_batch_that_failed_are_written_with_the_next_one(tmp_path: Path) -> None:
     path = tmp_path / "a.arrows"
     with open_writer(path, METADATA) as writer:
         for room in (0, 100, 700):
@@ -497,7 +497,7 @@ def test_compressed_batches_are_refused(tmp_path: Path) -> None:
         recorded(path)
 
 
-def test_damaged_line_of_csv_is_named(tmp_path: Path) -> None:
+def test_error_for_a_damaged_csv_line_names_the_line(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     record(path, 1)
     lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
@@ -507,7 +507,7 @@ def test_damaged_line_of_csv_is_named(tmp_path: Path) -> None:
             recorded(path)
 
 
-def test_damaged_metadata_of_csv_is_named(tmp_path: Path) -> None:
+def test_error_for_damaged_csv_metadata_names_the_file(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     record(path, 1)
     for damage in ("", "{", "[]"):

@@ -238,7 +238,7 @@ def test_too_many_ramps_at_once_are_refused(tmp_path: Path) -> None:
     assert found.startswith("a 2 ramps 12 drives of line hall at once: it would fit with ")
 
 
-def test_every_key_of_a_test_file_is_in_the_reference() -> None:
+def test_every_key_of_a_test_file_is_documented() -> None:
     page = (Path(__file__).parents[2] / "docs" / "reference" / "test-file.md").read_text("utf-8")
     keys = [key for table in (loader._TEST, loader._ABORT, loader._PHASE, loader._STEP) for key in table]
     assert [key for key in keys if f"\n| `{key}` | " not in page] == []

@@ -105,7 +105,7 @@ def unrepeated(found: list[Any]) -> list[Any]:
 
 
 def never(fan: MotorDrive) -> None:
-    """Change nothing during the run."""
+    """Do nothing: this abort needs no event."""
 
 
 # for each kind of abort: limits in the test file, the event that causes the abort, the reason in the result
@@ -472,7 +472,7 @@ class FarEnds:
                 return receive(frame)
             requests.append(frame.message)
             if is_write(frame.message):
-                sim._held.clear()  # a write is a stop: the high value ends
+                sim._held.clear()  # after a stop, the simulated values are normal again
             if self.event:
                 self._left[line.name] -= bool(self.test.phase)
                 if max(self._left.values()) > 0:
@@ -631,7 +631,7 @@ def test_the_first_stop_frame_of_an_abort_comes_within_two_bus_cycles(model: str
         )
     ) as (plan, sims):
         are_writes: list[bool] = []  # for each request: is it a write?
-        reads: list[int] = []  # which requests have read the high value
+        reads: list[int] = []  # indexes of the requests that have read the high value
         for sim in sims:
             _note(sim, are_writes, lambda: sims[0].__setitem__(limited, 0.0))  # the write is a stop
         refresh = sims[0].refresh

@@ -186,7 +186,9 @@ class UnitBuckets:
         self.untold = Accumulator(grid)
 
     def of_unit(self, unit: str | None, newest_ns: int) -> Accumulator:
-        """Return the accumulator for rows with this unit; `newest_ns` is the time of the newest such row."""
+        """Return the accumulator for rows with this unit. `newest_ns` is the time of the newest of these
+        rows.
+        """
         if unit is None:
             return self.untold
         self._newest_ns[unit] = max(newest_ns, self._newest_ns.get(unit, newest_ns))

@@ -208,7 +208,7 @@ def _parts(run: list[HistoryFile]) -> Iterator[list[HistoryFile]]:
 
 
 def _make_tens(database: Database, folder: Path, rows: list[HistoryFile]) -> None:
-    """Write those ten-second summaries of these files in `rows/` that are not in `tens/` yet."""
+    """Write the missing ten-second summaries of these files in `rows/` into `tens/`."""
     missing = _without_tens(folder, widest(parquet_files(folder / "tens")))
     for file in rows:
         if file.first in missing:

@@ -79,7 +79,7 @@ class GrowingSegment:
             self._holders += 1
 
     def let_go(self) -> None:
-        """End the effect of one call of `hold`. Close the file after the last of them."""
+        """Undo one call of `hold`. When all calls are undone, close the file."""
         with self._changing:
             self._holders -= 1
             if not self._holders:

@@ -91,7 +91,7 @@ class OtherColumn(NamedTuple):
 
 
 class Parting:
-    """The newest quantity of each series, and the series' earlier quantities.
+    """The quantity (unit, or names of values) that each series has now, and those that it had earlier.
 
     Buckets exclude values of earlier quantities.
 
@@ -108,7 +108,7 @@ class Parting:
         self.learn(known)
 
     def learn(self, known: Mapping[int, Known]) -> None:
-        """Add the quantities of further segments. The quantity of an existing column does not change."""
+        """Add the quantities of more segments. An existing column keeps its quantity."""
         before: Known | None = None
         for number in sorted(known.keys() - self._known.keys(), reverse=True):
             self._known[number] = found = known[number]
@@ -143,7 +143,7 @@ class Parting:
         ]
 
     def described(self, metadata: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the metadata, corrected so that each column is described by the quantity of its values."""
+        """Return the metadata with a correct description of every column, including the separate columns."""
         columns = {series: (series[1], quantity) for series, quantity in self.newest.items()}
         drives = {name: dict(_table(about)) for name, about in _table(metadata.get("drives")).items()}
         said = quantities_of(metadata)

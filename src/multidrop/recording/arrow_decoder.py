@@ -34,7 +34,7 @@ class RecordedColumns(NamedTuple):
 
     time: memoryview
     monotonic_ns: memoryview
-    uncertainty_ns: memoryview  # 0 for a miss
+    uncertainty_ns: memoryview  # 0 if the row has no value
     drive: memoryview
     register: memoryview
     value: memoryview  # undefined if the row has no value
@@ -155,7 +155,7 @@ class BatchDecoder:
 
 
 def _parts(batch: FlatTable, body: memoryview, count: int) -> tuple[int, list[bytes]]:
-    """Return a batch's number of rows and its `count` buffers.
+    """Return the number of rows of a batch, and its buffers. There must be `count` buffers.
 
     The buffers are copies. A memoryview of `body` that survives in an error's traceback would crash the
     interpreter.

@@ -36,7 +36,7 @@ MOST_NAMES = {DRIVE: 1 << 16, REGISTER: 1 << 16, STATUS: MOST_NARROW}  # limit o
 
 Names = tuple[str, ...]
 Column = Any  # memoryview, array or bytes: anything with a buffer
-Codes = dict[int, tuple[Column, Names]]  # id of a dictionary: the rows' codes, the names of codes
+Codes = dict[int, tuple[Column, Names]]  # by dictionary id: the code of each row, and the codes' names
 
 
 def schema_message(metadata: dict[bytes, bytes]) -> bytes:

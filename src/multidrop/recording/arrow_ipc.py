@@ -120,7 +120,7 @@ class Structs(bytes):
 def build(root: Table) -> bytes:
     """Return the flatbuffer of this table."""
     out = bytearray(4)
-    waiting: deque[tuple[int, Any]] = deque([(0, root)])  # (placeholder's position, its target)
+    waiting: deque[tuple[int, Any]] = deque([(0, root)])  # (position of an offset, its target)
     while waiting:
         place, thing = waiting.popleft()
         if isinstance(thing, dict):

@@ -183,7 +183,7 @@ class ArrowsTail:
                 return
             body = self._body(message)
             try:
-                # a failed write removes a dictionary and its batch, so read them again together
+                # a dictionary counts as read only with its batch: a failed write removes both
                 if message.kind != RECORD_BATCH:
                     self._decoder.decode(message, message.header, body)
                     continue

@@ -230,7 +230,7 @@ class AppendFile:
         written = 0
         try:
             while written < len(piece):
-                # Release the view now: if a traceback kept it, the underlying buffer could not grow.
+                # Release the view here: a buffer cannot grow while a traceback keeps a view of it.
                 with memoryview(piece)[written:] as left:
                     written += self._file.write(left)
         except BaseException:

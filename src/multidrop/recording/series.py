@@ -190,7 +190,9 @@ class SeriesWriter(RecordingWriter):
         self._thread.submit(work).result()
 
     def _open(self, work: Callable[[], Any]) -> None:
-        """Open the new file with this work; remove the file if the work fails or is interrupted."""
+        """Do this work, which creates the file, in the library's thread. Remove the file if the work fails or
+        is interrupted.
+        """
         try:
             self._in_thread(work)
         except BaseException:

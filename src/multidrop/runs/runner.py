@@ -411,7 +411,7 @@ class _Session:
         return None
 
     def _mark(self, phase: str) -> None:
-        """Note and record the start of a phase."""
+        """Set the present phase, and record a row at its start."""
         self._run.phase = phase
         if self._recording:
             number = self._run._phases.index(phase)
