@@ -325,7 +325,7 @@ class LineMeter:
             counted = sum(counters.exchanges for counters in counters_by_drive.values())
             if counted == sum(
                 peer.exchanges for peer in peers.values()
-            ):  # no exchange ended between the two readings of its counters
+            ):  # no exchange with a drive ended between the two readings
                 break
         seconds, counted_s = ((at_ns - self._opened_ns) / 1e9 for at_ns in (now_ns, counted_ns))
         epochs = {name: peer.number for name, peer in peers.items()}
