@@ -113,7 +113,7 @@ def test_stop_all_reports_failed_if_neither_broadcast_nor_stop_was_sent(
 
 
 class Quiet(Toy):
-    """A drive with one harmless broadcast, which is not a stop."""
+    """A drive whose only broadcast does not stop the motor."""
 
     model = "quiet"
     broadcasts = True
@@ -148,7 +148,7 @@ def test_stop_all_broadcasts_no_command_that_is_not_a_stop(
 
 
 @every_broadcasting
-def test_only_a_broadcast_stop_does_not_wait_for_late_replies(
+def test_a_broadcast_waits_for_late_replies_unless_it_is_a_stop(
     monkeypatch: pytest.MonkeyPatch, model: str
 ) -> None:
     line, drives, _ = line_of(monkeypatch, model, model)
@@ -245,7 +245,7 @@ def test_after_leave_stops_are_broadcast_but_setpoints_are_refused(
     line.bus.leave()
     with pytest.raises(CancelledByStop, match="the bus was left"):
         line.bus.broadcast(setpoint_of(drives[0]), 0.0)
-    line.bus.broadcast(drives[0].control, stop_of(drives[0]))  # a stop is still broadcast
+    line.bus.broadcast(drives[0].control, stop_of(drives[0]))  # stops are broadcast even after `leave`
     (sent,) = broadcasts(line)
     assert sent.start == drives[0].control.address
 
@@ -309,7 +309,7 @@ def test_a_setpoint_is_not_broadcast_if_a_drive_may_have_been_replaced(
 
 
 def test_a_stop_that_was_only_broadcast_is_reported_as_sent(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The port is lost after the broadcast, so that no other frame is sent."""
+    """The port is lost after the broadcast, so no stop is sent to a single drive."""
     line, _, _ = line_of(monkeypatch, "invt-che", "invt-che")
 
     def lose(request: Message) -> bytes | None:
@@ -410,7 +410,7 @@ def test_stop_all_broadcasts_a_stop_and_then_checks_each_drive(monkeypatch: pyte
     stopped = line.bus.stop_all()
     assert line.frames[begun][1] == "00 06 10 00 00 05 4C D8"
     assert {each.seen for each in stopped.values()} == {Seen.STOPPED}
-    assert all(each.seconds < 11 for each in stopped.values())  # all motors ramp down together
+    assert all(each.seconds < 11 for each in stopped.values())  # all motors ramp down at the same time
     assert all_stopped(line, sims)
 
 

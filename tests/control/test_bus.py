@@ -100,8 +100,8 @@ def test_read_many_returns_values_in_the_requested_order() -> None:
 
 REQUESTS = {  # requests for all readings, from the manuals' register maps and limits
     ErmanERG220: 2,  # two reads: 1 to 12, including unused addresses, and 0400H to 0403H
-    InvtCHE: 4,  # 1001H; 3000H to 3016H in two reads; 5000H and 5001H
-    InnovertIBD: 2,  # PrA.03 and PrA.04 in one read; PrA.22 in another
+    InvtCHE: 4,  # four reads: 1001H; 3000H to 3016H in two parts; 5000H and 5001H
+    InnovertIBD: 2,  # two reads: PrA.03 and PrA.04; PrA.22
     DelixiModbus: 32,  # one register per request
     DelixiNative: 33,
     YD1000: 16,
@@ -289,7 +289,7 @@ def test_a_lost_confirmation_of_an_unreadable_register_is_unconfirmed() -> None:
     assert str(caught.value) == "Rig@1: it is not known whether target = 1500 rpm took effect: no reply"
     assert (caught.value.drive, caught.value.what) == ("Rig@1", "target = 1500 rpm")
     assert sent(rig)[0x06] == 1
-    assert rig["target"] == 1500  # the write did take effect
+    assert rig["target"] == 1500  # the write took effect, although no reply confirmed it
 
 
 @pytest.mark.slow

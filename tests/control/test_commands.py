@@ -302,7 +302,7 @@ async def test_a_second_stop_is_repeated_after_the_first_has_given_up() -> None:
     await asyncio.sleep(0.05)
     before.set_result({"pump": SILENT})
     await until_met(lambda: pump.calls[-1] is None)  # the earlier stop gave up: now this one is repeated
-    assert pump.calls.count(None) == 1  # one repeated stop for both calls
+    assert pump.calls.count(None) == 1  # both calls share one repeated stop
     pump.turns.release()
     assert (await called)["pump"].ok is False
 
@@ -315,7 +315,7 @@ def test_a_repeated_stop_is_in_progress_from_its_call_to_its_end() -> None:
         repeated = asyncio.get_running_loop().create_future()
         pump.under_way = {}
         stops.note([drive], repeated)
-        assert stops.of(drive) is repeated  # even before the stop's thread has started
+        assert stops.of(drive) is repeated  # even if the thread of the stop has not started yet
         await asyncio.sleep(0.9 * BEGINNING_S)
         assert stops.of(drive) is repeated
         await asyncio.sleep(0.2 * BEGINNING_S)

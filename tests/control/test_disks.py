@@ -69,10 +69,10 @@ def test_reading_the_audit_log_skips_lines_that_are_not_records(tmp_path: Path) 
     assert [record["write"] for record in read_audit(path)] == ["a", "b"]
 
 
-def test_closing_waits_for_a_record_that_another_thread_writes(
+def test_closing_a_bus_waits_for_an_audit_record_of_another_thread(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A stop is recorded when it ends; the drive's line may be closed at the same time."""
+    """Otherwise a stop that ends while its bus is closed would not be recorded."""
     begun, go_on = threading.Event(), threading.Event()
 
     class SlowLog(AuditLog):
@@ -97,7 +97,7 @@ def test_closing_waits_for_a_record_that_another_thread_writes(
     assert [record["write"] for record in read_audit(path)] == ["control = STOP"]
 
 
-def test_queued_records_are_written_before_the_log_is_closed(tmp_path: Path) -> None:
+def test_queued_audit_records_are_written_before_the_log_is_closed(tmp_path: Path) -> None:
     path = tmp_path / "audit.jsonl"
     line: Any = SimpleNamespace(port="/dev/ttyUSB0", identity="usb-1")
     records = write_records.WriteRecords(line, Ledger(tmp_path / "ledger"), AuditLog(path))
@@ -289,7 +289,7 @@ def test_a_clock_set_back_by_an_hour_allows_one_additional_eeprom_write(tmp_path
     assert ledger.enter(CELL, NOON, 60.0) == ""
     set_back = NOON - HOUR
     assert ledger.enter(CELL, set_back, 60.0) == ""
-    for second in range(60):  # each second of the first minute after the change
+    for second in range(60):  # each second of the minute after the clock was set back
         assert "was written" in ledger.enter(CELL, set_back + second, 60.0)
     assert ledger.enter(CELL, set_back + 60, 60.0) == ""
     assert writes(ledger) == 3

@@ -65,11 +65,8 @@ tripped   reset_fault   ok   ok/?      ?    ?     ok/?    x         ?/ok ?      
 SEVERAL_WORDS = {"abb-acs355", "siemens-v20", "schneider-atv320"}  # a start takes several control words
 SECOND: dict[tuple[str, str], set[str]] = {
     ("set_frequency", "?"): {"innovert-ibd", "delixi-native", "danfoss-fc51", "delta-vfd-el"},  # not readable
-    ("set_frequency", "-"): {
-        "erman-er-g-220",
-        "delixi-modbus",
-        "yd1000",
-    },  # a limit or the present value is read before the write
+    # these drives read a limit or the present value before the write
+    ("set_frequency", "-"): {"erman-er-g-220", "delixi-modbus", "yd1000"},
     ("start", "ok"): SEVERAL_WORDS,
     ("start", "-"): SEVERAL_WORDS,
     ("start", "?"): {"yd1000"},  # a trip freezes its status
@@ -118,7 +115,7 @@ class Cell:
         return [write for write in self.writes if self._is_start(write)]
 
     def strike(self, fault: str) -> None:
-        """Make the line have this fault."""
+        """Start this fault on the line."""
         line = self.line
         losing: dict[str, Callable[[Message], bool]] = {
             "lost-once": lambda request: is_write(request) and len(self.writes) == 1,
@@ -169,7 +166,7 @@ class Cell:
 
 
 def check(cell: Cell, situation: str, verb: str, fault: str, outcome: str) -> None:
-    """Assert the rules that apply to every cell."""
+    """Check the rules that apply to every cell of TABLE."""
     assert len(cell.starts) <= (verb in TURNING), "a start is sent once, and only by a start"
     if outcome in ("-", "!", "n") and fault != "unreadable":
         assert cell.writes == [], "nothing was sent"
@@ -206,7 +203,7 @@ def test_each_verb_has_the_expected_outcome_during_each_fault(
         if fault == "exception" and family == NO_EXCEPTIONS:
             return
         with pytest.MonkeyPatch.context() as monkeypatch:
-            monkeypatch.setattr(records, "LEAST_INTERVAL", 0.0)  # s between EEPROM writes of one register
+            monkeypatch.setattr(records, "LEAST_INTERVAL", 0.0)  # s between two EEPROM writes of one register
             tried = Cell(monkeypatch, family, situation)
             tried.strike(fault)
             outcome = tried.outcome(verb)

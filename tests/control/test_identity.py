@@ -96,7 +96,7 @@ def test_a_drive_replaced_while_its_write_is_counted_is_not_written(monkeypatch:
 def test_a_silent_drive_is_identified_once_before_the_next_write(
     model: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(records, "LEAST_INTERVAL", 0.0)  # s between writes of one register to an EEPROM
+    monkeypatch.setattr(records, "LEAST_INTERVAL", 0.0)  # s between two EEPROM writes of one register
     with known(model) as (bus, drive, received):
         looks: list[str] = []
         monkeypatch.setattr(type(drive).identify, "_script", lambda drive: iter(looks.append("look") or ()))
@@ -171,7 +171,7 @@ def _idle(bus: Bus, drive: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     bus.peer(drive).c.answered_ns -= 2 * PAUSE_NS
     at_ns = clock.now_ns
     monkeypatch.setattr(clock, "now_ns", lambda: at_ns() + 2 * PAUSE_NS)
-    _asleep(bus, drive, monkeypatch)  # the boot-time clock must advance too
+    _asleep(bus, drive, monkeypatch)  # wait until the boot-time clock has advanced too
 
 
 def _read_since(bus: Bus, drive: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -276,7 +276,7 @@ def test_a_detached_drive_is_identified_again_before_a_start(monkeypatch: pytest
 
 
 def test_a_detached_drive_is_identified_again_before_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An allowed stop does not confirm the drive for a start."""
+    """A stop that is let through does not confirm the drive's identity for a start."""
     bus, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     odd = [build_reply(Framing.RTU, Message(1, 3, data=bytes([0, device]))) for device in (3, 4)]
     bus.answers = lambda request: odd.pop(0) if odd else None
@@ -305,7 +305,7 @@ def test_detaching_a_drive_forgets_that_its_identity_check_failed(monkeypatch: p
 
 
 class Mute(Drive):
-    """A user's drive whose class cannot identify it."""
+    """A user's drive class without `identify`."""
 
     model = "mute"
     title = "OWN 5"
@@ -382,7 +382,7 @@ def test_an_identity_check_by_undocumented_registers_never_withholds_a_stop(
 
 
 @pytest.mark.parametrize(("share", "looks"), [(0.6, 0), (1.1, 1)])
-def test_a_drive_that_just_answered_is_not_checked_again(
+def test_a_drive_that_answered_recently_is_not_identified_again(
     monkeypatch: pytest.MonkeyPatch, share: float, looks: int
 ) -> None:
     bus, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))

@@ -26,7 +26,7 @@ from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 from multidrop.transport import clock
 from multidrop.transport import line as of_a_port
 
-BAUDRATE = 38400  # for short silences between frames
+BAUDRATE = 38400  # high, so that silences between frames are short
 CODE = of_a_port.Line.carry_out.__code__
 
 

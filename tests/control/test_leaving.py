@@ -1,4 +1,4 @@
-"""Drives that are attached and detached on any thread: calls are cancelled, stops are sent and awaited."""
+"""Drives are attached and detached on any thread: their calls are cancelled, and their stops awaited."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def test_detached_drives_are_stopped_with_stop_on_exit(
     flush(60)
     told = [record.getMessage() for record in caplog.records if record.name == "multidrop.bus"]
     assert len(told) == 1
-    assert told[0].startswith("invt-che@2: failed after 30")  # neither its own stop nor `stop_all` was sent
+    assert told[0].startswith("invt-che@2: failed after 30")  # no stop was sent to this drive
     pair.line.answers = lambda request: None
 
 
@@ -165,7 +165,7 @@ def test_attaching_a_drive_of_another_open_bus_raises(monkeypatch: pytest.Monkey
     with pytest.raises(ValueError, match=r"invt-che@1 is on the bus at hall: detach it there first"):
         other.attach(drive)
     assert other.bus.drives == []
-    drive.state()  # its verbs still use the first bus
+    drive.state()  # the drive still uses the first bus
     line.bus.detach(drive)
     other.attach(drive)
     other.bus.close()

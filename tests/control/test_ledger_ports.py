@@ -1,4 +1,4 @@
-"""The ledger identifies drives by their port's hardware, counts EEPROM writes, and ignores simulators."""
+"""The ledger of EEPROM writes identifies ports by their hardware, and does not count simulated drives."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def test_an_adapter_is_identified_by_its_serial_number(
     cell = LedgerCell(str(link), 1, "m", "r", f"{tmp_path}/ttyUSB0")
     assert ledger.enter(cell, 1000.0, 60.0) == ""
     link.unlink()
-    link.symlink_to("../ttyUSB1")  # the adapter was plugged in again, at another device
+    link.symlink_to("../ttyUSB1")  # the adapter was plugged in again, under another device name
     moved = LedgerCell(port_identity.of_device(f"{tmp_path}/ttyUSB1"), 1, "m", "r", f"{tmp_path}/ttyUSB1")
     assert "was written 5 s ago" in ledger.enter(moved, 1005.0, 60.0)
 
@@ -203,7 +203,8 @@ def test_writes_to_a_simulated_drive_are_not_in_the_user_s_ledger(tmp_path: Path
     with toys(str(tmp_path / "link") if port == "link" else port) as sim:
         path = sim.wires[0].path.replace("0.0.0.0", "127.0.0.1")
         write(path, 12.0)
-        with pytest.raises(WriteForbidden, match="is written once in 60 s at most"):  # as for a real drive
+        # the limit of a real drive
+        with pytest.raises(WriteForbidden, match="is written once in 60 s at most"):
             write(path, 13.0)
     assert Ledger().wear(0) == []
     assert not list(default_path().parent.rglob("*.sqlite"))

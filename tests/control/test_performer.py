@@ -145,7 +145,7 @@ def test_a_reset_that_a_stop_cancels_still_clears_its_coil(
     line.bus.close()
 
 
-def test_a_plain_stop_is_recorded(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_stop_sent_as_a_plain_write_is_recorded(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     line, drive, _ = one(monkeypatch, InvtCHE(1), audit=tmp_path / "audit")
     drive.write(drive.control, CHEControl.STOP)
     line.bus._records.flush(60)
@@ -259,7 +259,7 @@ def test_a_write_is_logged_with_its_author(
     assert told == [sentence, f"{sentence} (by anna)", f"{sentence} (by anna, web)"]
 
 
-def test_refusals_are_logged(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+def test_refused_writes_are_logged(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "multidrop.control")
     line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     with pytest.raises(WriteForbidden) as refusal:
@@ -464,7 +464,7 @@ def test_a_setpoint_that_eeprom_already_holds_becomes_known_without_a_write(
     assert drive.commanded == 20
 
 
-def test_a_plain_write_sets_the_known_setpoint(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_writing_the_setpoint_register_sets_the_known_setpoint(monkeypatch: pytest.MonkeyPatch) -> None:
     bus, drive = told(monkeypatch, lambda: InnovertIBD(1, maximum_frequency=50))
     drive.write(drive.register("frequency"), 30)
     assert drive.commanded == 30

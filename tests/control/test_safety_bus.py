@@ -229,7 +229,9 @@ def test_only_stops_are_sent_while_a_late_reply_is_due(monkeypatch: pytest.Monke
     assert all(insisted)
 
 
-def test_an_exception_is_reported_with_the_family_s_meaning(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_modbus_exception_is_reported_with_its_meaning_for_the_family(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     line, drive, _ = one(monkeypatch, InvtCHE(1))
     line.bus.check_identity(drive)
     refusal = build_reply(Framing.RTU, Message(1, 6, exception=0x12))

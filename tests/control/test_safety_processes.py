@@ -1,4 +1,4 @@
-"""Processes that exit or die, two processes with one ledger, and an adapter's echo, on real ports."""
+"""On real ports: processes that exit or are killed, two processes with one EEPROM ledger, and echoes."""
 
 from __future__ import annotations
 
@@ -180,7 +180,7 @@ def test_processes_that_share_an_audit_log_do_not_mix_their_lines(tmp_path: Path
 
 
 @table("torn_at", range(0, 120, 7))
-def test_a_truncated_line_of_the_audit_log_damages_no_other(tmp_path: Path, torn_at: int) -> None:
+def test_a_truncated_line_of_the_audit_log_damages_no_other_line(tmp_path: Path, torn_at: int) -> None:
     path = tmp_path / "audit.jsonl"
     log = AuditLog(path)
     log.add(0, {"write": "first"})

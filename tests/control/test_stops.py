@@ -207,7 +207,7 @@ def test_a_stop_ends_after_its_time_limit_and_the_error_states_its_progress(
     assert 100 <= line.seconds - begun < 102
     sent = len(writes(line))
     with pytest.raises(Unconfirmed):
-        drive.stop(seconds=0)  # sent only once
+        drive.stop(seconds=0)  # with 0 s, the stop is sent only once
     assert len(writes(line)) == sent + 1
 
 
@@ -394,7 +394,7 @@ def test_a_stop_reopens_a_lost_port_unless_a_poller_does(
     line.bus.tended(tended)
     with pytest.raises(LineError):
         drive.read(drive.status)
-    opened.clear()  # forget that the read tried to open the port
+    opened.clear()  # the read has tried to open the port: not counted
     with pytest.raises(LineError):
         drive.stop(seconds=1)
     drive.stop()
@@ -541,7 +541,7 @@ class Hanging(logging.Handler):
 
 
 def test_a_stop_is_sent_even_if_a_log_handler_hangs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """A locked ledger prevents no stop either, and one drive's records do not delay another drive's stop."""
+    """The audit log and the EEPROM ledger hang too. The stop of the second drive waits for none of them."""
     line = SimulatedBus(monkeypatch, *(simulated(Own(number)) for number in (1, 2)), audit=tmp_path / "audit")
     first, second = (line.attach(Own(address)) for address in (1, 2))
     hangs, released = threading.Event(), threading.Event()
@@ -560,7 +560,7 @@ def test_a_stop_is_sent_even_if_a_log_handler_hangs(monkeypatch: pytest.MonkeyPa
         stopping.start()
         stopping.join(60)
         assert not stopping.is_alive()
-        assert hangs.wait(60)  # another thread writes the records
+        assert hangs.wait(60)  # now the log hangs, on another thread
         assert len(writes(line)) == 4
     finally:
         released.set()
@@ -585,7 +585,7 @@ def noting(line: SimulatedBus) -> list[str]:
     return told
 
 
-def test_a_stop_reports_its_progress_while_the_motor_runs_out(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_reports_its_progress_while_the_motor_slows_down(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(monkeypatch, YD1000(1))
     drive.set_frequency(20)
     drive.start()

@@ -162,7 +162,7 @@ def test_a_stop_whose_replies_are_lost_is_repeated_unchanged(model: str, lost: i
         assert not received.sim.motor.energised
 
 
-def test_closing_waits_for_a_stop_in_progress() -> None:
+def test_closing_a_bus_waits_for_a_stop_in_progress() -> None:
     with line("invt-che") as (bus, drive, received, _):
         drive.set_frequency(20)
         drive.start()

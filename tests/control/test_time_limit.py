@@ -101,7 +101,7 @@ class Slow(Drive):
 
 
 @pytest.mark.parametrize(("before", "between", "sent"), [(0.1, 0.1, 2), (0.1, 5.0, 2), (0.9, 0.1, 0)])
-def test_no_verb_starts_after_the_limit_but_a_started_verb_continues(
+def test_no_verb_starts_after_the_time_limit_but_a_started_verb_continues(
     monkeypatch: pytest.MonkeyPatch, before: float, between: float, sent: int
 ) -> None:
     """Unlike the limit, the bus's own expiry does not count the time that a script waits."""
@@ -157,7 +157,7 @@ def test_a_stop_called_by_the_limit_function_cancels_the_call(line: SimulatedBus
 
 
 @table("limit", [0.5, True, "1", None])
-def test_with_an_invalid_limit_only_a_stop_is_sent(monkeypatch: pytest.MonkeyPatch, limit: Any) -> None:
+def test_with_an_invalid_time_limit_only_a_stop_is_sent(monkeypatch: pytest.MonkeyPatch, limit: Any) -> None:
     line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     with written_before(limit):
         for call in (lambda: drive.set_frequency(20), drive.start):
@@ -224,7 +224,7 @@ def test_a_start_is_not_sent_if_the_computer_slept_during_its_checks(
     check_not_sent(monkeypatch, tmp_path, model, sleep_for_a_night)
 
 
-def test_slow_reads_do_not_expire_a_start(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_start_does_not_expire_because_of_slow_reads(monkeypatch: pytest.MonkeyPatch) -> None:
     class Sleepy(Own):
         """A drive whose start waits and reads twenty times."""
 
@@ -274,7 +274,7 @@ def test_the_least_interval_of_a_drive_does_not_count_towards_expiry(
     assert len(line.written) == is_sent
 
 
-def test_slow_writes_do_not_expire_a_verb(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_verb_does_not_expire_because_of_slow_writes(monkeypatch: pytest.MonkeyPatch) -> None:
     """A ramp has more writes than fit into the expiry of one call."""
     line, drive, _ = one(monkeypatch, YD1000(1))
     drive.set_frequency(1)
@@ -320,7 +320,7 @@ def test_a_start_is_not_sent_when_the_computer_wakes(tmp_path: Path, sleeps: boo
     answer, begun, slept = sim.answer, tmp_path / "begun", tmp_path / "slept"
 
     def answer_and_sleep(request: Message, now: float) -> Message | None:
-        if sleeps and begun.exists():  # sleeps at the first read of the start
+        if sleeps and begun.exists():  # the computer sleeps at the first read of the start
             slept.touch()
         return answer(request, now)
 

@@ -225,7 +225,7 @@ def test_adopt_adds_and_removes_lines() -> None:
         assert sorted(made.opened) == ["port of hall", "port of hall", "port of yard"]
 
 
-def test_every_slot_of_a_removed_line_has_a_row() -> None:
+def test_every_time_slot_before_a_line_is_removed_has_a_row() -> None:
     with clocked(hall(*pumps()), yard(*fans())) as made:
         rows = made.run(2.05)
         made.poller.remove_line("yard")

@@ -421,7 +421,9 @@ def _is_asking(poller: Poller, of: PolledDrive) -> bool:
     return bus.is_asking(bus.peer(of.drive))
 
 
-def test_closing_waits_for_an_adoption(both: TwoLines, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_closing_a_poller_waits_for_adopt_on_another_thread(
+    both: TwoLines, monkeypatch: pytest.MonkeyPatch
+) -> None:
     poller = Poller(plant(both.hall()))
     poller.__enter__()
     with Blocked() as opening:

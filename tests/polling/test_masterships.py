@@ -453,7 +453,7 @@ class Busy:
 
 
 @table(("left_ns", "waited_ns"), [(0, S), (S // 5, S // 5), (-S, 0), (5 * S, S)])
-def test_closing_waits_for_a_request_in_flight_until_the_mastership_ends(
+def test_closing_a_poller_waits_for_a_request_until_the_mastership_ends(
     monkeypatch: pytest.MonkeyPatch, left_ns: int, waited_ns: int
 ) -> None:
     """The mastership ends `left_ns` after the start, and soon afterwards the kernel kills the process. With

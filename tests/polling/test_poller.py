@@ -449,7 +449,7 @@ def test_polling_continues_after_a_stop_reopened_the_port(port: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_lost_line_does_not_disturb_other_lines(port: str, tmp_path: Path) -> None:
+def test_a_line_with_a_lost_port_does_not_disturb_other_lines(port: str, tmp_path: Path) -> None:
     link = tmp_path / "hall-2"
     lines = [
         line(port, polled(drive(), ONE), name="hall-1"),
@@ -569,7 +569,7 @@ def responder() -> Iterator[tuple[int, str]]:
 
 
 @pytest.mark.parametrize("every", [None, 1.0], ids=["in turn", "at a rate"])
-def test_closing_waits_for_exchanges_in_flight(
+def test_closing_a_poller_waits_for_exchanges_in_flight(
     responder: tuple[int, str], every: float | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     master, path = responder

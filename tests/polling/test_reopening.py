@@ -142,12 +142,11 @@ def test_a_stop_reopens_a_lost_port_after_the_poller_has_failed(
 def server(
     is_last: Callable[[int, int], bool], idle_s: float | None = None, closes: list[bytes] | None = None
 ) -> Iterator[str]:
-    """Serve Modbus TCP to one client at a time. Close the connection after the nth request if `is_last(nth,
-    address)` is True, and if no request comes for `idle_s` s.
+    """Serve Modbus TCP to one client at a time. The value of each register is its address.
 
-    The number n starts at 1 for each connection. Each register's value is its address. At a request for the
-    address `DEADLY`, the server closes the connection without a reply. For each idle connection that it
-    closes, the server adds to `closes` the request that came just before, or else b"".
+    The server closes a connection after its nth request if `is_last(nth, address)` is True, or if no request
+    comes for `idle_s` s. It closes the connection without a reply if the address is `DEADLY`. When it closes
+    an idle connection, it adds to `closes` the request that came just before, or b"" if none came.
     """
     with socket.create_server(("127.0.0.1", 0)) as listener:
 

@@ -90,8 +90,8 @@ def test_the_first_value_at_a_new_rate_is_read_immediately(two: ClockedLines) ->
     assert values(two.run(1))["pump-1", "fault"] == 1
 
 
-def test_registers_with_an_unchanged_rate_keep_their_slots() -> None:
-    """The registers keep their slots, although the register with the new rate is no longer in their block."""
+def test_registers_with_an_unchanged_rate_keep_their_time_slots() -> None:
+    """They keep them although the register with the new rate is no longer read in the same block."""
     with clocked(polled(toy(), ALL, 0.1)) as made:
         begun = made.run(3)[0].monotonic_ns
         made.poller.set_rate("pump-1", "output_frequency", 0.25)
@@ -154,7 +154,7 @@ def test_memory_is_bounded_over_many_changes_of_rates() -> None:
     assert all(now <= then + 4 for now, then in zip(after, before, strict=True)), (before, after)
 
 
-def test_skipped_slots_remain_counted_after_their_rate_is_changed() -> None:
+def test_skipped_time_slots_stay_counted_after_a_change_of_the_rate() -> None:
     with clocked(polled(toy(), ALL, 0.001)) as made:
         made.run(2)
         (before,) = (line["overrun_slots"] for line in made.poller.summary()["lines"].values())

@@ -427,7 +427,7 @@ def test_reading_through_a_closed_bus_raises_that_it_is_closed() -> None:
         assert str(caught.value) == f"{sim.wires[0].path}: it is closed"
 
 
-def test_closing_ends_exchanges_that_wait_for_a_reply() -> None:
+def test_closing_a_bus_ends_exchanges_that_wait_for_a_reply() -> None:
     """One thread waits for a silent drive, another closes the bus."""
     failures: list[LineError] = []
     master, slave = os.openpty()
