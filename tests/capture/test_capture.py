@@ -50,7 +50,7 @@ def registers(data: bytes) -> list[int]:
 
 
 @pytest.mark.long
-def test_wireshark_decodes_every_printed_exchange(tmp_path: Path) -> None:
+def test_wireshark_decodes_every_exchange_printed_in_manuals(tmp_path: Path) -> None:
     packets = tshark(write(tmp_path / "a.pcapng", RTU))
     assert len(packets) == 2 * len(RTU) > 20
     for number, packet in enumerate(packets):
@@ -82,7 +82,7 @@ def test_wireshark_decodes_every_printed_exchange(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_wireshark_sees_a_bad_checksum(tmp_path: Path) -> None:
+def test_wireshark_reports_a_bad_checksum_in_a_capture(tmp_path: Path) -> None:
     bad = next(each for each in PRINTED if each.verdict == "bad checksum")
     with CaptureWriter(tmp_path / "a.pcapng") as capture:
         capture.write(bad.frame, Side.ASKING, BEGIN, "hall-1")
@@ -113,7 +113,7 @@ def test_each_line_is_a_pcapng_interface_with_the_lines_name(tmp_path: Path) -> 
 # ---- our reader, with captures of ours and of other programs ----
 
 
-def test_frames_are_read_as_they_were_written(tmp_path: Path) -> None:
+def test_a_capture_is_read_back_with_the_written_frames(tmp_path: Path) -> None:
     exchanges = [*RTU, *TEXT]
     (found,) = spans(write(tmp_path / "a.pcapng", exchanges)).values()
     assert [(span.kind, span.time_ns, span.raw) for span in found] == [

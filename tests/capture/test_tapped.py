@@ -158,14 +158,14 @@ def mixed(tmp_path_factory: pytest.TempPathFactory) -> Mixed:
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_a_capture_of_all_variants_decodes_to_the_recording(mixed: Mixed) -> None:
+def test_a_capture_of_all_family_variants_decodes_to_the_polled_rows(mixed: Mixed) -> None:
     check(mixed.rows, mixed.decoded)
     samples = {row.drive for row in mixed.decoded if row.value is not None}
     assert samples == {polled.drive.name for polled in mixed.drives}
 
 
 @pytest.mark.long
-def test_wireshark_reads_the_capture(mixed: Mixed) -> None:
+def test_wireshark_decodes_a_capture_of_all_family_variants(mixed: Mixed) -> None:
     """Check address, registers and times of each request to an RTU drive, and the registers of each reply."""
     packets = tshark(mixed.capture)
     by_time = {each["frame.time_epoch"]: (number, each) for number, each in enumerate(packets, 1)}
@@ -219,7 +219,7 @@ def test_a_capture_of_a_disturbed_line_decodes_to_the_polled_rows(
 
 
 @pytest.mark.long
-def test_a_damaged_reply_is_modbus_with_a_bad_checksum_in_wireshark(tmp_path: Path) -> None:
+def test_wireshark_shows_a_damaged_reply_as_modbus_with_a_bad_checksum(tmp_path: Path) -> None:
     frame = bytes.fromhex("01 03 02 13 88 B5 13")
     with CaptureWriter(tmp_path / "a.pcapng", ["hall-1"]) as capture:
         for side in (Side.FAILED, Side.NOISE):
@@ -338,7 +338,7 @@ def seconds_in(path: Path) -> list[int]:
         ]
 
 
-def test_an_anomaly_saves_the_minutes_before_and_after_it_to_a_file(
+def test_the_flight_recorder_saves_the_traffic_around_an_anomaly(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one_flight = Flight(tmp_path / "flights", monkeypatch, seconds=20)
@@ -354,7 +354,9 @@ def test_an_anomaly_saves_the_minutes_before_and_after_it_to_a_file(
     assert b"hall-1: pump-1: bad checksum; hall-1: pump-2: fell silent\0" in path.read_bytes()[:200]
 
 
-def test_two_recorders_may_write_in_the_same_second(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_flight_recorders_may_write_files_in_the_same_second(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for _ in range(2):
         one_flight = Flight(tmp_path, monkeypatch)  # the clocks of both recorders start at the same time
         one_flight.pass_(10, "hall-1: pump-1: bad checksum")

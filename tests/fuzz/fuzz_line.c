@@ -72,7 +72,7 @@ static int is_read(const struct md_message *request)
     return request->function <= 0x04;
 }
 
-/* Check that these bytes include at least one of the drive's reply to the present exchange. */
+/* Check that at least one of these bytes is from the drive's reply to the present exchange. */
 static void check_origin(const uint8_t *raw, size_t len)
 {
     int is_own = 0;

@@ -47,7 +47,7 @@ def rows(tmp_path: Path) -> list[list[Row]]:
 
 
 def check(folder: Path, rows: list[Row]) -> None:
-    """Check that rows, exports and buckets of the history in this folder agree with these rows."""
+    """Check that the rows and buckets that History returns for this folder agree with these rows."""
     with History(folder) as history:
         assert sorted(rows_in(history)) == sorted(rows)
         for points in (6, 4000):
@@ -61,7 +61,7 @@ def check(folder: Path, rows: list[Row]) -> None:
 
 
 @pytest.mark.slow
-def test_a_parquet_file_has_its_segment_s_rows(tmp_path: Path) -> None:
+def test_a_compacted_file_has_the_rows_of_its_segment(tmp_path: Path) -> None:
     rows = random_rows(1, NOON, 500)
     record(tmp_path, [rows, random_rows(2, NOON + DAY, 5)])
     compact(tmp_path, 2)

@@ -58,7 +58,7 @@ def flat(rows: list[list[Row]]) -> list[Row]:
 
 @pytest.mark.slow
 @COMPACTED
-def test_rows_come_in_the_order_of_recording(folder: Path, rows: list[list[Row]]) -> None:
+def test_a_history_returns_rows_in_the_order_of_recording(folder: Path, rows: list[list[Row]]) -> None:
     with History(folder) as history:
         found = history.read()
         assert found.metadata == METADATA
@@ -86,7 +86,7 @@ def test_history_reads_the_given_series_in_the_given_time_range(folder: Path, ro
 
 @pytest.mark.long
 @COMPACTED
-def test_buckets_equal_those_of_plain_python(folder: Path, rows: list[list[Row]]) -> None:
+def test_buckets_of_a_history_equal_those_of_plain_python(folder: Path, rows: list[list[Row]]) -> None:
     dice = random.Random(6)
     times = [row.time_ns for row in flat(rows)]
     with History(folder) as history:

@@ -208,7 +208,9 @@ def test_an_unwritable_folder_raises_permission_error_immediately() -> None:
         HistoryWriter(directory / "history", METADATA)
 
 
-def test_only_one_process_records_at_a_time(tmp_path: Path, writers: Callable[..., HistoryWriter]) -> None:
+def test_only_one_process_records_into_a_history(
+    tmp_path: Path, writers: Callable[..., HistoryWriter]
+) -> None:
     writers(tmp_path)
     with pytest.raises(ValueError, match="is being recorded by another process"):
         HistoryWriter(tmp_path, METADATA)

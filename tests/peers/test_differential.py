@@ -304,7 +304,7 @@ def libmodbus(tmp_path_factory: pytest.TempPathFactory) -> Libmodbus:
 
 
 @pytest.mark.long
-def test_requests_decode_as_in_libmodbus_server(libmodbus: Libmodbus) -> None:
+def test_requests_are_decoded_as_by_a_libmodbus_server(libmodbus: Libmodbus) -> None:
     """Check that the server's replies and registers match our decoding of each request."""
     requests = frames(1, RTU, NUMBER, replies=False)
     differences = []
@@ -323,7 +323,7 @@ def test_requests_decode_as_in_libmodbus_server(libmodbus: Libmodbus) -> None:
 
 
 @pytest.mark.long
-def test_requests_and_replies_equal_libmodbus_client(libmodbus: Libmodbus) -> None:
+def test_requests_and_decoded_replies_equal_those_of_a_libmodbus_client(libmodbus: Libmodbus) -> None:
     replies = [frame for frame in frames(2, RTU, NUMBER, replies=True) if frame.request.function != 0x08]
     differences = []
     values = 0
@@ -345,7 +345,7 @@ def name(framing: Framing) -> str:
 
 @pytest.mark.long
 @framings
-def test_requests_decode_as_in_pymodbus_server(framing: Framing) -> None:
+def test_requests_are_decoded_as_by_a_pymodbus_server(framing: Framing) -> None:
     pymodbus = Pymodbus(framing)
     differences = []
     for said in frames(3, framing, NUMBER, replies=False):
@@ -356,7 +356,7 @@ def test_requests_decode_as_in_pymodbus_server(framing: Framing) -> None:
 
 @pytest.mark.long
 @framings
-def test_replies_decode_as_in_pymodbus_client(framing: Framing) -> None:
+def test_replies_are_decoded_as_by_a_pymodbus_client(framing: Framing) -> None:
     pymodbus = Pymodbus(framing)
     differences = []
     for said in frames(4, framing, NUMBER, replies=True):
@@ -366,7 +366,7 @@ def test_replies_decode_as_in_pymodbus_client(framing: Framing) -> None:
 
 @pytest.mark.slow
 @framings
-def test_replies_encode_as_in_pymodbus(framing: Framing) -> None:
+def test_replies_are_encoded_as_by_pymodbus(framing: Framing) -> None:
     pymodbus = Pymodbus(framing)
     whole = [frame for frame in frames(5, framing, NUMBER, replies=True) if not frame.damage]
     for said in whole:

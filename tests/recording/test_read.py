@@ -35,7 +35,7 @@ def path(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
 
 
 @pytest.mark.slow
-def test_every_format_is_read_as_the_same_table(path: Path) -> None:
+def test_recordings_of_every_format_are_read_as_the_same_table(path: Path) -> None:
     found = multidrop.open_recording(path)
     assert found.metadata == METADATA
     table = pa.table(found)

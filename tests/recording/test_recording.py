@@ -58,7 +58,7 @@ def rows(reader: RecordingReader) -> list[Row]:
 
 
 @every_format
-def test_rows_are_read_as_they_were_written(tmp_path: Path, suffix: str) -> None:
+def test_a_recording_is_read_back_with_the_written_rows(tmp_path: Path, suffix: str) -> None:
     reader = open_recording(record(tmp_path / f"a{suffix}"))
     assert reader.metadata == METADATA
     assert reader.truncated == 0
@@ -559,9 +559,9 @@ def test_all_exception_codes_are_recorded_in_one_batch(tmp_path: Path) -> None:
     assert rows_of(pa.ipc.open_stream(path.read_bytes()).read_all()) == [*batch, *batch]
 
 
-def test_a_row_takes_at_most_35_bytes(tmp_path: Path) -> None:
-    """The rows are those of 31 drives with 10 values each, at 10 Hz, in batches of 0.1 s. Some rows are
-    misses.
+def test_a_row_in_an_arrows_file_takes_at_most_35_bytes(tmp_path: Path) -> None:
+    """The rows are those of 31 drives with 10 values each, at 10 Hz, in batches of 0.1 s. Some rows have no
+    value.
     """
     drives = Names([f"pump-{number}" for number in range(31)])
     registers = Names([f"some_register_{number}" for number in range(10)])

@@ -189,7 +189,7 @@ def test_repair_leaves_a_whole_recording_unchanged(tmp_path: Path, suffix: str) 
     assert path.read_bytes() == before
 
 
-def test_an_end_marker_is_not_reported_as_a_truncated_end(tmp_path: Path) -> None:
+def test_the_end_marker_of_an_arrow_stream_is_not_a_truncated_end(tmp_path: Path) -> None:
     path = tmp_path / "a.arrows"
     table = pa.table(example())
     with pa.ipc.new_stream(path, table.schema) as stream:
@@ -488,7 +488,7 @@ def test_parquet_file_that_unpacks_to_gigabytes_is_refused(
         list(open_recording(path))
 
 
-def test_compressed_batches_are_refused(tmp_path: Path) -> None:
+def test_arrow_files_with_compressed_batches_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.arrows"
     table = pa.table(counting(2000))
     with pa.ipc.new_stream(path, table.schema, options=pa.ipc.IpcWriteOptions(compression="zstd")) as stream:
@@ -519,7 +519,7 @@ def test_error_for_damaged_csv_metadata_names_the_file(tmp_path: Path) -> None:
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("suffix", FORMATS)
-def test_damage_anywhere_raises_a_one_sentence_error(tmp_path: Path, suffix: str) -> None:
+def test_damage_anywhere_in_a_recording_raises_a_one_sentence_error(tmp_path: Path, suffix: str) -> None:
     """Random bytes are overwritten. Then the reader may return wrong values or fewer rows, or raise a
     one-sentence error, but never crash.
     """

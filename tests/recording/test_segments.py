@@ -82,7 +82,7 @@ def test_segment_numbers_grow_after_a_restart(tmp_path: Path, hand: Hand) -> Non
     assert names(tmp_path)[-1] == "run.00000071.arrows"
 
 
-def test_other_files_are_not_segments(tmp_path: Path) -> None:
+def test_files_with_other_names_are_not_segments(tmp_path: Path) -> None:
     for name in ("run.arrows", "run.1.arrows", "other.00000009.arrows", "run.00000009.arrows.bak"):
         (tmp_path / name).write_bytes(b"precious")
     with SegmentWriter(tmp_path / "run.arrows", ABOUT, every=60, keep=1.0, most=1000) as writer:
@@ -103,7 +103,7 @@ def test_changed_metadata_starts_a_new_segment(tmp_path: Path) -> None:
     )
 
 
-def test_only_one_process_records_at_a_time(tmp_path: Path) -> None:
+def test_only_one_process_records_into_the_same_segments(tmp_path: Path) -> None:
     path = tmp_path / "run.arrows"
     with SegmentWriter(path, ABOUT, every=60):
         with pytest.raises(ValueError, match=r"run\.arrows is being recorded by another process"):
@@ -128,7 +128,9 @@ def test_an_incomplete_batch_of_a_killed_writer_is_cut_off(tmp_path: Path) -> No
     (_, segment), *_ = segments_of(path)
     os.truncate(segment, segment.stat().st_size - 20)
     SegmentWriter(path, ABOUT, every=60).close()
-    assert pa.ipc.open_stream(segment.read_bytes()).read_all().num_rows == 3  # pyarrow refuses a cut end
+    assert (
+        pa.ipc.open_stream(segment.read_bytes()).read_all().num_rows == 3
+    )  # pyarrow refuses truncated files
 
 
 def test_a_long_unreadable_end_is_never_cut_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,7 +20,7 @@ from multidrop.runs.watch import LimitWatch
 EEPROM = {"model": "delixi-modbus", "framing": "rtu", "poll": ["output_frequency"]}
 
 
-def test_lists_and_repetitions_become_steps_with_planned_times(tmp_path: Path) -> None:
+def test_lists_and_repetitions_in_a_test_file_become_planned_steps(tmp_path: Path) -> None:
     text = """
     [abort]
     limits = ["fan.output_current >= 30", "pump.fault != 0"]
@@ -115,7 +115,7 @@ MISTAKES = {  # text of a test file: number of the wrong line, part of the error
 
 
 @table("text, line, sentence", [(text, *found) for text, found in MISTAKES.items()])
-def test_each_mistake_is_reported_in_one_sentence_that_names_its_line(
+def test_each_mistake_in_a_test_file_is_reported_with_its_line(
     text: str, line: int, sentence: str, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     folder = tmp_path_factory.mktemp("mistake")
@@ -148,7 +148,7 @@ def test_error_for_a_plant_file_instead_of_a_test_file_names_the_command(tmp_pat
         load_test(plant)
 
 
-def test_a_condition_compares_a_computed_channel(tmp_path: Path) -> None:
+def test_a_condition_may_compare_a_computed_channel(tmp_path: Path) -> None:
     path = write_test(tmp_path, STEP + 'until = "fan.double > 3"\nwithin = "1 s"')
     with (tmp_path / "plant.toml").open("a") as plant:
         plant.write('[[line.drive.channel]]\nname = "double"\nvalue = "output_current * 2"\nunit = "A"\n')
@@ -287,7 +287,7 @@ def test_a_fault_aborts_only_if_the_test_uses_the_drive(watch: LimitWatch) -> No
     assert watch.add([row("pump", "fault", 4.0)]).startswith("pump has a fault, ")
 
 
-def test_a_changed_fault_record_is_a_fault_but_an_old_record_is_not(tmp_path: Path) -> None:
+def test_a_change_of_a_fault_record_aborts_but_an_old_record_does_not(tmp_path: Path) -> None:
     pump = {"model": "erman-er-g-220", "poll": ["output_frequency", "last_fault"]}
     watch = LimitWatch(load_test(write_test(tmp_path, TEXT, fan=CHE, pump=pump)), 2 * S, 0)
     assert watch.add([row("pump", "last_fault", 3.0), row("pump", "last_fault", 3.0)]) == ""

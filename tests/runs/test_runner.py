@@ -612,7 +612,9 @@ FAMILIES = [model for model in (*MODELS, *SHIPPED) if find_model(model).stop is 
 
 @pytest.mark.long
 @pytest.mark.parametrize("model", FAMILIES)
-def test_the_first_stop_frame_of_an_abort_comes_within_two_bus_cycles(model: str, tmp_path: Path) -> None:
+def test_each_familys_first_stop_after_an_abort_comes_within_two_bus_cycles(
+    model: str, tmp_path: Path
+) -> None:
     """The simulated drives count requests from the read of the high value to the first write, which is a
     stop.
     """

@@ -103,7 +103,7 @@ def test_error_for_a_port_that_cannot_be_opened_gives_the_reason(guest: Guest) -
 
 
 @pytest.mark.slow
-def test_a_16550_has_the_settings_of_the_drive(guest: Guest) -> None:
+def test_a_16550_uart_has_the_drives_port_settings(guest: Guest) -> None:
     wanted = [(1200, "8N1"), (9600, "8E1"), (19200, "8O1"), (57600, "8E2"), (115200, "8N1"), (9600, "7E1")]
     for (baudrate, form), fact in zip(wanted, guest.run("uart", wanted=wanted), strict=True):
         assert fact == {"read": RIGHT, "kernel": [baudrate, form]}
