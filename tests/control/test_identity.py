@@ -276,7 +276,7 @@ def test_a_detached_drive_is_identified_again_before_a_start(monkeypatch: pytest
 
 
 def test_a_detached_drive_is_identified_again_before_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A stop that is let through does not confirm the drive's identity for a start."""
+    """Sending a stop does not confirm the drive's identity for a start."""
     bus, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
     odd = [build_reply(Framing.RTU, Message(1, 3, data=bytes([0, device]))) for device in (3, 4)]
     bus.answers = lambda request: odd.pop(0) if odd else None

@@ -92,7 +92,7 @@ def test_an_interrupted_exchange_does_not_delay_the_next_exchange(monkeypatch: p
 # ---- interrupted stops and starts ----
 
 
-# The stop of these families has two writes: the second withdraws START, or ends a jog.
+# families whose stop has two writes: the second withdraws START, or ends a jog
 OF_TWO_WRITES = ("erman-er-g-220", "invt-che")
 
 

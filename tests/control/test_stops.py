@@ -541,7 +541,7 @@ class Hanging(logging.Handler):
 
 
 def test_a_stop_is_sent_even_if_a_log_handler_hangs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """The audit log and the EEPROM ledger hang too. The stop of the second drive waits for none of them."""
+    """The audit log and the EEPROM ledger hang too. The second drive's stop does not wait for them."""
     line = SimulatedBus(monkeypatch, *(simulated(Own(number)) for number in (1, 2)), audit=tmp_path / "audit")
     first, second = (line.attach(Own(address)) for address in (1, 2))
     hangs, released = threading.Event(), threading.Event()

@@ -100,7 +100,7 @@ class Rows:
         port.report_to(self.row_queue, 0)
 
     def of(self, name: str, rows: int) -> list[int]:
-        """Wait until there are `rows` rows; return the column `name` of these rows."""
+        """Wait until there are `rows` rows; return their column `name`."""
         wait_until(lambda: self._taken() >= rows)
         return [each for columns in self._columns for each in columns.array(name)]
 

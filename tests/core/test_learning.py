@@ -1,4 +1,4 @@
-"""What the core learns from a drive's replies: when to read the port, how long to wait, what may be late."""
+"""Learning from a drive's replies: when to read the port, how long to wait, which replies may be late."""
 
 from __future__ import annotations
 

@@ -263,7 +263,7 @@ def test_a_removed_drive_is_freed_at_once() -> None:
 
 
 def test_outages_that_end_at_the_same_row_have_different_times() -> None:
-    """If two rows have the same series and time, InfluxDB keeps only one of them."""
+    """InfluxDB keeps only one row for each pair of series and time."""
     names = RowNames()
     added = AddedRows(names)
     added.adopt(plant(line("/dev/ttyUSB0", pump(CHARGE, replace(CHARGE, name="more")))), {})

@@ -102,7 +102,7 @@ def check_stop(opened: Bus, line: PathLine, sim: SimulatedDrive, seconds: float)
         sim.motor.run(1)
         opened.drives[0].stop()
     assert not sim.motor.energised
-    assert sent_after[0] < 1  # s; time for the identity check, of which one read may get no reply
+    assert sent_after[0] < 1  # s; includes the identity check, in which one read may get no reply
     assert (line.now - begun) / S < 8 * seconds + 3
     return len(sent_after)
 
