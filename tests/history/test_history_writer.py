@@ -216,7 +216,7 @@ def test_only_one_process_records_into_a_history(
         HistoryWriter(tmp_path, METADATA)
 
 
-def test_an_exception_does_not_end_the_recording(
+def test_an_exception_in_the_history_writers_thread_does_not_end_it(
     tmp_path: Path, writers: Callable[..., HistoryWriter], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def wrong(*_: object) -> object:

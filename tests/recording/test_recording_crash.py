@@ -319,7 +319,7 @@ def test_recording_continues_when_the_disk_has_room_again(tmp_path: Path, suffix
 def test_a_read_only_directory_raises_a_one_sentence_error(tmp_path: Path, suffix: str) -> None:
     open_writer(
         tmp_path / f"a{suffix}", METADATA
-    ).close()  # import the writer's modules before the child gives up root's rights
+    ).close()  # import the writer's modules now: the user `nobody` may not be allowed to read them
     with read_only_directory() as directory:
         path = directory / f"a{suffix}"
         with pytest.raises(RecordingError) as failure:

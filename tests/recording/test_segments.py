@@ -88,7 +88,7 @@ def test_files_with_other_names_are_not_segments(tmp_path: Path) -> None:
     with SegmentWriter(tmp_path / "run.arrows", ABOUT, every=60, keep=1.0, most=1000) as writer:
         writer.write(rows(0))
         assert writer.number == 1
-    assert len([*tmp_path.iterdir()]) == 6  # the four other files, a segment, and the lock file
+    assert len([*tmp_path.iterdir()]) == 6  # six: the four files above, the new segment, and its lock file
 
 
 def test_changed_metadata_starts_a_new_segment(tmp_path: Path) -> None:

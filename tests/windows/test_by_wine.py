@@ -226,7 +226,7 @@ print(_engine.is_realtime)
 
 
 def test_realtime_scheduling_of_a_poll_ends_with_the_poll(wine: Wine, pump: MotorDrive, plant: Path) -> None:
-    """Wine grants realtime scheduling without any effect, so this test shows only that the calls work."""
+    """Wine grants realtime scheduling. This test shows only that the calls work, not their effect."""
     ran = wine.run("-c", REALTIME, plant)
     assert ran.stdout.split() == [b"True", b"10", b"False"], ran.stderr
     assert b"realtime" not in ran.stderr

@@ -176,8 +176,8 @@ def files_of(paths: Iterable[Path]) -> str:
 
 
 def with_units(paths: Iterable[Path]) -> str:
-    """Return the SQL that reads Parquet files as one table with the file names. In files without `unit` it is
-    null.
+    """Return the SQL that reads Parquet files as one table with the file names. Files without the column
+    `unit` have null in it.
     """
     files = f"read_parquet({_list(paths)}, union_by_name = true, filename = true)"
     return f"(select * from {files} union all by name select null::varchar as unit where false)"

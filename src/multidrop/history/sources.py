@@ -266,8 +266,8 @@ def write_parquet(
     metadata: Metadata,
     renamed: Mapping[int, Iterable[OtherColumn]],
 ) -> int:
-    """Write a Parquet file of these batches, and of the files' rows of the series in this range. Return the
-    number of rows.
+    """Write a Parquet file with these batches, and with the rows of `files` that are of these series and in
+    this range. Return the number of rows.
 
     `renamed` maps the first segment of a file to the columns that `rows_of_file` takes. Raises Replaced.
     """

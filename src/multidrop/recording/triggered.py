@@ -82,7 +82,8 @@ class TriggeredWriter(RecordingWriter):
         """Record a batch from a poller."""
         assert isinstance(batch, Batch)
         kept = copied(batch)
-        # Ignore the times of events: rows that are older than an event may still come after it.
+        # Find the newest time without events, because rows that are older than an event may still come after
+        # it.
         columns = kept.columns()
         times = zip(columns.drive, columns.monotonic_ns, strict=True)
         newest_ns = max((ns for drive, ns in times if columns.drives[drive] != EVENT), default=0)

@@ -63,7 +63,7 @@ def attempt(call: Callable[..., object], *arguments: Any, **options: Any) -> Any
 
 
 def until_answered(call: Callable[..., object], *arguments: Any) -> Any:
-    """Return what attempt() returns. Repeat the call if a driver has lost its adapter.
+    """Return what attempt() returns. Repeat the call if the error says that the adapter failed.
 
     pl2303 gives its adapter 100 ms to answer a USB request. An emulated adapter on a busy computer may need
     longer.
