@@ -323,9 +323,8 @@ class LineMeter:
             now_ns = clock.now_ns()
             counted_ns = self._exchanges.line.counted_ns(now_ns)
             counted = sum(counters.exchanges for counters in counters_by_drive.values())
-            if counted == sum(
-                peer.exchanges for peer in peers.values()
-            ):  # no exchange with a drive ended between the two readings
+            # no exchange with a drive ended between the two readings
+            if counted == sum(peer.exchanges for peer in peers.values()):
                 break
         seconds, counted_s = ((at_ns - self._opened_ns) / 1e9 for at_ns in (now_ns, counted_ns))
         epochs = {name: peer.number for name, peer in peers.items()}
