@@ -175,7 +175,7 @@ class AnomalyWatch:
     def __init__(self, name: str, bus: Bus) -> None:
         self._name = name
         self._bus = bus
-        self._drives = [_WatchedDrive(bus, drive) for drive in bus.drives]
+        self._drives = [_TappedDrive(bus, drive) for drive in bus.drives]
         self._is_lost = False
 
     def check(self) -> Iterator[str]:
@@ -189,7 +189,7 @@ class AnomalyWatch:
                 yield f"{self._name}: {drive.name}: {anomaly}"
 
 
-class _WatchedDrive:
+class _TappedDrive:
     def __init__(self, bus: Bus, drive: Drive) -> None:
         self.name = drive.name
         self._peer = bus.peer(drive)

@@ -291,10 +291,7 @@ class Drive(RegisterAccess):
         return register.name
 
     def take_framing_of(self, port: str) -> None:
-        """Use TCP framing if the port is a tcp:// port, otherwise the declared framing.
-
-        Raises ValueError if the drive cannot be used on the port.
-        """
+        """Use TCP framing on a tcp:// port, else the declared one; raise ValueError if that is impossible."""
         self.framing = framing_on(
             port,
             self._declared_framing,
@@ -342,10 +339,7 @@ class Drive(RegisterAccess):
 
     @property
     def echo_probe(self) -> Register[Any] | None:
-        """Register whose reply always differs from the request; None if the family has none.
-
-        It is read first, to find out whether the RS-485 adapter returns an echo of each request.
-        """
+        """Register whose reply never equals its request, to detect an echo; None if the family has none."""
         return None
 
     def known_counts(self) -> Mapping[Register[Any], tuple[int, int]]:
@@ -489,10 +483,7 @@ class Drive(RegisterAccess):
 
     @verb
     def identify(self) -> Script[None]:
-        """Read registers to check that the drive is of this family. Raises WriteForbidden if it is not.
-
-        A drive that passes may still be of another family, because few drives identify themselves.
-        """
+        """Read registers; raise WriteForbidden if their values show a drive of another family."""
         yield from ()
 
     def resembles(self) -> Script[bool]:

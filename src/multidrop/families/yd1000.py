@@ -446,10 +446,7 @@ class YD1000(Drive):
 
     @verb
     def jog(self, direction: Direction | None = None) -> Script[None]:
-        """Turn slowly until stopped.
-
-        Without a direction, keep a turning motor's direction, or turn forward.
-        """
+        """Jog until stopped. Without a direction, keep a turning motor's direction, or turn forward."""
         yield from self._turn(YD1000Control.JOG, direction)
 
     def _turn(self, how: YD1000Control, direction: Direction | None) -> Script[None]:
@@ -583,10 +580,7 @@ class YD1000(Drive):
 
     @verb
     def state(self) -> Script[State]:
-        """Return whether the motor turns.
-
-        A frozen 1200H, or a new entry in the fault record, shows a fault.
-        """
+        """Return whether the motor turns. A frozen 1200H or a new entry in the fault record is a fault."""
         if not (yield from self._is_at_rest()):
             return State(Condition.RUNNING, (yield from self._direction()))
         record = yield from read(self.fault_record_1)

@@ -186,9 +186,7 @@ class UnitBuckets:
         self.untold = Accumulator(grid)
 
     def of_unit(self, unit: str | None, newest_ns: int) -> Accumulator:
-        """Return the accumulator for rows with this unit. `newest_ns` is the time of the newest of these
-        rows.
-        """
+        """Return the accumulator for rows with this unit. `newest_ns` is the time of their newest row."""
         if unit is None:
             return self.untold
         self._newest_ns[unit] = max(newest_ns, self._newest_ns.get(unit, newest_ns))

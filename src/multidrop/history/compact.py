@@ -179,9 +179,7 @@ def finished(files: list[HistoryFile], seconds: int, missing: set[int]) -> list[
 
 
 def _merge(database: Database, run: list[HistoryFile], query: str, *, keeps_metadata: bool) -> None:
-    """Merge these files into one file in their folder. With `keeps_metadata`, that file gets the metadata of
-    the last of them.
-    """
+    """Merge these files into one in their folder. With `keeps_metadata`, it gets the last file's metadata."""
     begin, end = min(file.begin for file in run), max(file.end for file in run)
     path = run[0].path.with_name(file_name(run[0].first, run[-1].last, begin * 10**9, end * 10**9))
     with database.cursor() as cursor:
@@ -208,7 +206,7 @@ def _parts(run: list[HistoryFile]) -> Iterator[list[HistoryFile]]:
 
 
 def _make_tens(database: Database, folder: Path, rows: list[HistoryFile]) -> None:
-    """Write the missing ten-second summaries of these files in `rows/` into `tens/`."""
+    """Write the ten-second summaries into `tens/` for each of the files that lacks them."""
     missing = _without_tens(folder, widest(parquet_files(folder / "tens")))
     for file in rows:
         if file.first in missing:

@@ -130,7 +130,7 @@ class Parting:
             self._columns[series, quantity] = f"{series[1]} [{words}]"
 
     def unknown_of(self, numbers: Iterable[int]) -> list[int]:
-        """Return those of these segment numbers whose quantities were not added yet."""
+        """Return the segment numbers whose quantities are not known yet."""
         return [number for number in numbers if number not in self._known]
 
     def renamed(self, number: int) -> list[OtherColumn]:

@@ -266,10 +266,10 @@ def write_parquet(
     metadata: Metadata,
     renamed: Mapping[int, Iterable[OtherColumn]],
 ) -> int:
-    """Write a Parquet file with these batches, and with the rows of `files` that are of these series and in
-    this range. Return the number of rows.
+    """Write a Parquet file with these batches and the rows of `files` in this range, for these series.
 
-    `renamed` maps the first segment of a file to the columns that `rows_of_file` takes. Raises Replaced.
+    `renamed` maps the first segment of a file to the columns that `rows_of_file` takes. Return the number of
+    rows. Raises Replaced.
     """
     condition, values = _condition(series)
     values |= dict(zip(("begin", "end"), range_ns, strict=True))

@@ -326,10 +326,8 @@ def test_a_command_of_a_sparkplug_host_is_decoded(field: str, value: object) -> 
     sent = messages.Payload(timestamp=1234, seq=3)
     sent.metrics.add(name="setpoint", alias=9, datatype=10, timestamp=5, **{field: value})
     sent.metrics.add(name="nothing", is_null=True)
-    assert read_command(sent.SerializeToString()) == (
-        1234,
-        [ReceivedMetric("setpoint", 9, value), ReceivedMetric("nothing", None, None)],  # type: ignore[arg-type]
-    )
+    setpoint = ReceivedMetric("setpoint", 9, value)  # type: ignore[arg-type]
+    assert read_command(sent.SerializeToString()) == (1234, [setpoint, ReceivedMetric("nothing", None, None)])
 
 
 @given(st.binary(max_size=300))
@@ -347,7 +345,8 @@ def test_a_damaged_command_is_decoded_or_raises_value_error(data: st.DataObject)
     whole = bytearray(payload(5, [Metric(DataType.DOUBLE, 2.5, 5, "setpoint", 3)], 1))
     whole[data.draw(st.integers(0, len(whole) - 1))] = data.draw(st.integers(0, 255))
     del whole[data.draw(st.integers(0, len(whole))) :]
-    test_any_bytes_are_decoded_or_refused_as_a_command.hypothesis.inner_test(bytes(whole))  # type: ignore[attr-defined]
+    decoded = test_any_bytes_are_decoded_or_refused_as_a_command
+    decoded.hypothesis.inner_test(bytes(whole))  # type: ignore[attr-defined]
 
 
 # ---- all rows over MQTT: JSON on a topic of each drive, and historical values of a Sparkplug node ----

@@ -62,10 +62,7 @@ def enumeration(owner: str, given: Mapping[str, Any]) -> type[IntEnum]:
 
 
 def flags(owner: str, given: Mapping[str, Any]) -> type[IntFlag]:
-    """Return an IntFlag of a register's named bits, given by bit number.
-
-    Raises ValueError with all mistakes.
-    """
+    """Return an IntFlag of a register's named bits, by bit number. Raises ValueError with all mistakes."""
     _check("bits", given, MOST_BITS, range(MOST_BITS), f"a bit's number, 0 to {MOST_BITS - 1}")
     make: Any = IntFlag
     return cast(type[IntFlag], make(owner, {name: 1 << bit for name, bit in given.items()}))
@@ -420,10 +417,7 @@ class Declared:
     def _addresses(
         self, given: Mapping[str, Any], good: dict[str, Any], place: TomlPlace, read: ReadAddress
     ) -> tuple[int, str] | None:
-        """Return the register's address in requests and its table; None after a mistake.
-
-        A `ram_address` is stored in `good`.
-        """
+        """Return the register's address in requests and its table; None after a mistake."""
         if "at" not in given or ("table" in given and "table" not in good):
             good.pop("ram_address", None)
             return None
