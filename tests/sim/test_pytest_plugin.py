@@ -47,18 +47,8 @@ def test_ten_tests_of_another_package_pass_in_parallel(
         if re.search("pump-1,output_current,.*,ok", rows.read_text()):
             break
     capture.rename(tmp_path / "hall.pcapng")
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-q",
-        "-n",
-        "2",
-        "-p",
-        "no:cacheprovider",
-        "-p",
-        "no:benchmark",
-    ]
+    options = ["-q", "-n", "3", "-p", "no:cacheprovider", "-p", "no:benchmark"]
+    command = [sys.executable, "-m", "pytest", *options]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=180)
     assert re.search(r"^11 passed", done.stdout, re.MULTILINE), done.stdout + done.stderr
 
