@@ -1,10 +1,9 @@
-"""Make texts safe to show, parse numbers and times, and make hints for wrong names or missing libraries."""
+"""Make texts from files and arguments safe to show, parse numbers, and suggest names for wrong ones."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from functools import lru_cache
 from typing import TypeGuard
 
 # Stricter than int() and float(), which also accept `1_0` for 10, and digits of all scripts.
@@ -85,64 +84,3 @@ def did_you_mean(name: str, known: Iterable[str], otherwise: str = "", most: int
     if near := nearest_names(name, known, most):
         return f"did you mean {' or '.join(near)}?"
     return otherwise or f"there are {', '.join(known) or 'none'}"
-
-
-# ---- UTC in ns as ISO 8601 text, such as 2026-11-21T09:30:00.123456789Z ----
-
-
-_SECOND_NS = 1_000_000_000
-
-
-def format_time(time_ns: int) -> str:
-    """Return a time in ns since 1970 (UTC) as text."""
-    second, rest = divmod(time_ns, _SECOND_NS)
-    return f"{_format_second(second)}.{rest:09d}Z"
-
-
-def parse_time(text: str) -> int:
-    """Return the ns since 1970 (UTC). Raises ValueError unless the text has the form of `format_time`."""
-    second, dot, rest = text.partition(".")
-    if not dot or len(rest) != 10 or rest[-1] != "Z":
-        raise ValueError(text)
-    return _parse_second(second) * _SECOND_NS + int(rest[:-1])
-
-
-@lru_cache(maxsize=1024)
-def _format_second(second: int) -> str:
-    from datetime import datetime, timedelta  # imported here: `multidrop --help` does not need it
-
-    return (datetime(1970, 1, 1) + timedelta(seconds=second)).isoformat()
-
-
-@lru_cache(maxsize=1024)
-def _parse_second(text: str) -> int:
-    from datetime import datetime, timedelta
-
-    return (datetime.fromisoformat(text).replace(tzinfo=None) - datetime(1970, 1, 1)) // timedelta(seconds=1)
-
-
-# ---- missing libraries ----
-
-
-def install_command(*extras: str) -> str:
-    """Return the pip command for the libraries of these extras.
-
-    The command names each library, because pip finds `multidrop[extra]` only in the directory of the sources.
-    The names of the extras follow as a shell comment.
-    """
-    # imported here, because most programs never need it
-    import shlex
-    from importlib.metadata import PackageNotFoundError, requires
-
-    try:
-        found = [one.partition(";") for one in requires("multidrop") or ()]
-    except PackageNotFoundError:
-        found = []
-    markers = [f'extra == "{extra}"' for extra in extras]
-    wanted = [
-        name.strip()
-        for name, _, given in found
-        if any(marker in given.replace("'", '"') for marker in markers)
-    ]
-    named = f"multidrop[{','.join(extras)}]"
-    return f"pip install {shlex.join(wanted)}  # {named}" if wanted else f"pip install '{named}'"

@@ -21,7 +21,7 @@ OUTSIDE = {
 }
 # packages by floor, the lowest floor first: a package may import only from lower floors
 FLOORS = [
-    {"errors", "exposition", "printable", "supervisor", "whole_file"},
+    {"errors", "exposition", "extras", "iso_time", "printable", "supervisor", "whole_file"},
     {"toml_lines", "toml_syntax"},
     {"toml_document"},
     {"toml_check"},
@@ -92,6 +92,8 @@ OPEN = {
         "samples.sample_tables",
         "errors",
         "exposition",
+        "extras",
+        "iso_time",
         "printable",
         "supervisor",
         "toml_check",

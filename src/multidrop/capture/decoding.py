@@ -32,9 +32,9 @@ from multidrop.core import (
 from multidrop.drive.family import Drive
 from multidrop.drive.number_format import bits_in
 from multidrop.drive.register import Carrier, Register, row_field
+from multidrop.iso_time import format_time
 from multidrop.plant.model import Plant, PlantLine
 from multidrop.polling.batch import Batch
-from multidrop.printable import format_time
 
 ROWS = 1 << 16  # limit of rows per batch
 _MOST_NAMES = 60_000  # limit of register names per batch, because a name's code has 16 bits

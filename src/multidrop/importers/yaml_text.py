@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-from multidrop.printable import install_command
+from multidrop.extras import install_command
 
 MOST_CHARACTERS = 1_000_000
 MOST_NODES = 50_000  # limit of nodes; an alias counts as many nodes as it stands for

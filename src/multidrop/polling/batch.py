@@ -20,7 +20,8 @@ from typing import Any, NamedTuple, NoReturn
 from multidrop.channels import SlotRow
 from multidrop.core import STATUSES, Columns, Names, spell
 from multidrop.core.columns import COLUMNS, find_codes
-from multidrop.printable import did_you_mean, install_command
+from multidrop.extras import install_command
+from multidrop.printable import did_you_mean
 
 
 class ArrowTable(ABC):

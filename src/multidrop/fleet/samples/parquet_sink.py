@@ -29,8 +29,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from multidrop.extras import install_command
 from multidrop.fleet.samples.hub import Commit, NotThisHubs, StoredPosition
-from multidrop.printable import install_command
 from multidrop.recording import FileLock
 from multidrop.samples import ROWS, SinkError
 from multidrop.whole_file import UNFINISHED, whole_file
