@@ -21,7 +21,7 @@ from nats_clusters import Cluster, Node, server_program, started_cluster
 from peers import require_program
 from serial_hall import SerialHall
 
-from multidrop.fleet.servers.connections import connect_options
+from multidrop.fleet.servers.credentials import connect_options
 from multidrop.fleet.servers.rights import ROUTE_PORTS, STORE, TlsFiles, write_files
 
 GATEWAYS = ("gw-a", "gw-b", "gw-c")

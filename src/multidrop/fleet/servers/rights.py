@@ -45,7 +45,7 @@ from urllib.parse import urlsplit
 
 from multidrop.fleet.samples.samples_stream import STREAM
 from multidrop.fleet.servers import names
-from multidrop.fleet.servers.connections import inbox_of, new_seed, public_key
+from multidrop.fleet.servers.credentials import inbox_of, new_seed, public_key
 from multidrop.fleet.servers.setup import CONTEST
 from multidrop.printable import masked
 from multidrop.whole_file import whole_file
