@@ -53,8 +53,6 @@ Admit = Callable[[str], float]
 
 _CALL = re.compile(r"(?P<how>call |run `multidrop )?\b(?P<verb>[a-z_-]+)(?P<end>\(\)|`)?")
 _log = logging.getLogger("multidrop.gateway")
-NOT_STARTED = "the stop was NOT sent: the fleet's part has not started; use the hard-wired stop"
-WHOLE = "the fleet"  # in the answer to a stop: the key of the result for the whole fleet
 
 
 class UnknownDrive(ValueError):
@@ -207,6 +205,8 @@ class Commands:
         what = f"{drive}.{register}"
         if caller.role < Right.WRITE:
             return denied(caller, Right.WRITE, f"a write of {what}")
+        if (unsupported := self._unsupported("write")) is not None:
+            return unsupported
         if drive not in drives_of(self._lines.plant):
             return _refused(UnknownDrive(drive))
         if what not in self.may.write:
@@ -228,6 +228,8 @@ class Commands:
 
         Callers over Modbus and tool ports are refused, because no person confirms their commands.
         """
+        if (unsupported := self._unsupported(verb)) is not None:
+            return unsupported
         drive = drive_meant(drive, names_of(self._lines)) if verb in STOPPING else drive
         what = f"{drive}.{verb}"
         rule = VERBS.get(verb)
@@ -267,6 +269,10 @@ class Commands:
         _log.warning("%s: %s, asked for by %s: %s", drive, what, caller.by, why)
         with _written_by(caller), suppress(ValueError):  # raised if a reload has removed the line
             self._lines.bus(line).note_refused(drive, what, why)
+
+    def _unsupported(self, verb: str) -> CommandResult | None:
+        """Return the refusal of a verb, or of "write", that this gateway never carries out."""
+        return None
 
     def _moves(self, drive: str, register: str) -> bool:
         """Return True for a register whose writes may start or stop the motor."""
@@ -437,6 +443,9 @@ def _used(call: re.Match[str]) -> str:
 
 # ---- the commands of a gateway whose lines are polled by a fleet ----
 
+NOT_STARTED = "the stop was NOT sent: the fleet's part has not started; use the hard-wired stop"
+WHOLE = "the fleet"  # in the answer to a stop: the key of the result for the whole fleet
+
 
 class FleetStops(Commands):
     """Stops the drives of a fleet of gateways; refuses all other commands.
@@ -489,26 +498,9 @@ class FleetStops(Commands):
             for name, (is_done, text) in answers.items()
         }
 
-    async def write(
-        self, drive: str, register: str, value: float, caller: Caller, admit: Admit = lambda what: inf
-    ) -> CommandResult:
-        if caller.role < Right.WRITE:
-            return denied(caller, Right.WRITE, f"a write of {drive}.{register}")
-        return _only_stops("write")
-
-    async def act(
-        self,
-        drive: str,
-        verb: str,
-        options: Mapping[str, object],
-        caller: Caller,
-        admit: Admit = lambda what: inf,
-    ) -> CommandResult:
+    def _unsupported(self, verb: str) -> CommandResult | None:
         if verb == "stop":
-            return await super().act(drive, verb, options, caller, admit)
-        return _only_stops(verb.replace("_", "-"))
-
-
-def _only_stops(verb: str) -> CommandResult:
-    sentence = f"this page only stops a fleet's drives; use `multidrop fleet {verb}`"
-    return CommandResult(CommandOutcome.REFUSED, sentence, WriteForbidden(sentence, rule=NOT_LISTED))
+            return None
+        command = verb.replace("_", "-")
+        sentence = f"this page only stops a fleet's drives; use `multidrop fleet {command}`"
+        return CommandResult(CommandOutcome.REFUSED, sentence, WriteForbidden(sentence, rule=NOT_LISTED))
