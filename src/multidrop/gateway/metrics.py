@@ -18,7 +18,7 @@ from multidrop import Register
 from multidrop.exposition import MetricFamily
 from multidrop.gateway.live.alarms import KINDS, PORT, Alarm
 from multidrop.gateway.live.frames import lost_of
-from multidrop.gateway.live.hub import FAULT, RUNS, SILENT, STANDS, UNKNOWN, Hub
+from multidrop.gateway.live.hub import STATES, Hub
 from multidrop.gateway.live.views import health_of
 from multidrop.transport import LineStatistics
 
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 # one sample of a metric: suffix of the metric's name, labels, value
 Sample = tuple[str, Mapping[str, str], float]
 HEALTH = ("ok", "degraded", "failed")
-STATES = (RUNS, STANDS, FAULT, SILENT, UNKNOWN)
 
 
 class BaseUnit(NamedTuple):

@@ -8,6 +8,7 @@ from typing import Any
 from multidrop.gateway.commands import STOPPING
 from multidrop.gateway.http.rights import COMMAND_ID
 from multidrop.gateway.live.alarms import KINDS
+from multidrop.gateway.live.hub import STATES
 
 Schema = Mapping[str, Any]
 
@@ -129,7 +130,7 @@ _VALUE: Schema = {
 }
 _SHOWN = some(
     "note",
-    state={"enum": ["runs", "stands", "fault", "silent", "unknown"]},
+    state={"enum": [*STATES]},
     fault=maybe(TEXT),
     why=maybe(TEXT),
     seen=maybe(WHOLE),

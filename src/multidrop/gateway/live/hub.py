@@ -23,7 +23,7 @@ from multidrop.plant import current_for, series_of
 KeptRow = tuple[int, int, float, int]
 # a register with its newest row, its newest row with a value, and whether that value is fresh
 Known = tuple[Register[Any], KeptRow | None, KeptRow | None, bool]
-RUNS, STANDS, FAULT, SILENT, UNKNOWN = "runs", "stands", "fault", "silent", "unknown"
+STATES = RUNS, STANDS, FAULT, SILENT, UNKNOWN = "runs", "stands", "fault", "silent", "unknown"
 UNNAMED = "it shows a fault"  # text of a fault without a text of its own
 NOT_ASKED = "not asked recently"  # text for the state UNKNOWN if the drive was not polled recently
 # text for the state UNKNOWN if some values are missing, so that the drive may have a fault
@@ -113,9 +113,7 @@ class Newest(NamedTuple):
 
 
 class Shown(NamedTuple):
-    """A drive's state (RUNS, STANDS, FAULT, SILENT or UNKNOWN), and the text that describes a fault or
-    silence.
-    """
+    """A drive's state (one of STATES), and the text that describes a fault or silence."""
 
     state: str
     words: str | None
@@ -336,7 +334,7 @@ class Hub:
     # ---- states ----
 
     def state(self, drive: str) -> str:
-        """Return "runs", "stands", "fault", "silent" or "unknown"."""
+        """Return one of STATES."""
         return self.seen(drive).state
 
     def seen(self, drive: str) -> Shown:

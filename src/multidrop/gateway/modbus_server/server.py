@@ -15,7 +15,7 @@ from multidrop.gateway.clock import monotonic_ns
 from multidrop.gateway.commands import Commands
 from multidrop.gateway.http.connections import listen
 from multidrop.gateway.http.rights import Right
-from multidrop.gateway.live.hub import Hub
+from multidrop.gateway.live.hub import SILENT, Hub
 from multidrop.gateway.modbus_server.address_map import AddressRow, address_map
 from multidrop.gateway.modbus_server.clients import SWEEP_S, Answer, ModbusClient, ModbusPort, RoundShare
 from multidrop.gateway.modbus_server.passed_requests import ClientWrites, LineShare, Standstill
@@ -176,7 +176,7 @@ class ModbusServer:
             raise Declined(ModbusCode.ILLEGAL_ADDRESS)
         if passing == "declared" and not unit.is_declared(request.function, addresses):
             raise Declined(ModbusCode.ILLEGAL_ADDRESS)
-        if passing == "off" or self._hub.state(unit.drive.name) == "silent":
+        if passing == "off" or self._hub.state(unit.drive.name) == SILENT:
             # not sent: the setting `passing` is "off", or the drive is silent
             raise Declined(ModbusCode.NO_RESPONSE)
         if client.is_full:

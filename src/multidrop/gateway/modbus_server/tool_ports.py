@@ -71,7 +71,7 @@ SWEEP_S = 1.0  # interval, in s, of checking for idle connections
 # the answer to a stop waits for the motor, and a read waits for the line, for at most this share of `timeout`
 WAIT_SHARE = 0.75
 # Exception codes for a drive that cannot be reached. On a real line, a tool would get no reply then.
-_SILENT = (ModbusCode.NO_PATH, ModbusCode.NO_RESPONSE)
+_UNREACHABLE = (ModbusCode.NO_PATH, ModbusCode.NO_RESPONSE)
 _log = logging.getLogger("multidrop.gateway")
 # A function that starts a request. It returns None if the request gets no answer. Else it returns an
 # awaitable of the answer's frame, or of None if it turns out that no answer is sent.
@@ -316,7 +316,7 @@ class ToolLine:
 
         async def finish() -> bytes | None:
             frame = await answer
-            return None if frame[7] & EXCEPTION and frame[8] in _SILENT else frame
+            return None if frame[7] & EXCEPTION and frame[8] in _UNREACHABLE else frame
 
         return finish()
 
@@ -368,7 +368,7 @@ class ToolLine:
 
 def _exception(request: MbapRequest, code: int) -> bytes | None:
     """Return the frame of an exception reply; None if a tool on a real line would get no reply."""
-    return None if code in _SILENT else request.exception(code)
+    return None if code in _UNREACHABLE else request.exception(code)
 
 
 async def _at_once(frame: bytes | None) -> bytes | None:

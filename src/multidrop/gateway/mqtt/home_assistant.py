@@ -14,7 +14,7 @@ from typing import Any
 
 from multidrop import Drive, Register
 from multidrop.drive import Access
-from multidrop.gateway.live.hub import FAULT, RUNS, SILENT, STANDS, UNKNOWN, digits_of
+from multidrop.gateway.live.hub import FAULT, RUNS, STANDS, STATES, digits_of
 
 DISCOVERY = "homeassistant"
 CLASSES = {  # by unit: the device_class of a sensor in Home Assistant
@@ -28,7 +28,6 @@ CLASSES = {  # by unit: the device_class of a sensor in Home Assistant
     "h": "duration",
     "s": "duration",
 }
-STATES = (RUNS, STANDS, FAULT, SILENT, UNKNOWN)
 # ids of the other components end with these words, so a register with such a name gets another id
 OWN = ("problem", "running", "set", "value")
 MOST = 1e12  # largest absolute value in the range of a number
