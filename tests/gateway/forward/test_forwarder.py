@@ -15,7 +15,7 @@ from lines import until
 from spooled import exchanges_in, numbered, rows_of
 from tables import table
 
-from multidrop.gateway.forward.forwarder import MOST_GAPS, SLOW_S, RowForwarder, SpoolPosition
+from multidrop.gateway.forward.forwarder import MOST_GAPS, RowForwarder, SpoolPosition
 from multidrop.gateway.sending import Refused
 from multidrop.samples import Spool
 
@@ -237,7 +237,7 @@ def test_a_hanging_receiver_is_reported(clocked: Clocked) -> None:
     found = []
 
     def hang() -> None:
-        clocked.now_s += SLOW_S + 1
+        clocked.now_s += clocked.forwarder.slow_s + 1
         found.append(clocked.forwarder.problem)
 
     clocked.receiver.on_call = hang

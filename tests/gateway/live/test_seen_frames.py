@@ -25,7 +25,7 @@ from multidrop.control import CommandResult
 from multidrop.gateway import commands as commands_module
 from multidrop.gateway.clock import boottime_ns
 from multidrop.gateway.http.rights import Right
-from multidrop.gateway.live.frames import ANOTHER_PLANT, DOUBLED, MOST_AGE_NS, OVERTAKEN, TOO_LATE, SeenFrames
+from multidrop.gateway.live.frames import ANOTHER_PLANT, DOUBLED, MOST_AGE_NS, TOO_LATE, SeenFrames
 
 MAY = """[serve.may]
 stop = "anyone"
@@ -79,7 +79,7 @@ def test_a_command_with_an_unknown_page_frame_number_is_refused(times: Times) ->
 def test_a_stop_invalidates_earlier_commands_of_its_own_drive_only(times: Times) -> None:
     times.frames.note(7)
     times.stopped["pump-1"] = times.now_ns  # the same time as the frame, so the stop may have been later
-    assert times.rule(7) == OVERTAKEN
+    assert times.rule(7) == commands_module.OVERTAKEN
     assert times.rule(7, "pump-2") == ""
     times.now_ns += 1
     times.frames.note(8)

@@ -35,7 +35,6 @@ from multidrop.whole_file import whole_file
 
 MOST_ROWS = 2000  # limit of rows in one request or MQTT message, about 250 kB of JSON
 NOT_FINITE = "not a finite number"  # status of a row whose value JSON and InfluxDB cannot represent
-SLOW_S = 40.0  # a receiver that takes longer than this (in s) for one message is reported
 REMOVED_S = 0.01  # pause in s after the full spool has removed the message that was about to be sent
 # limit of gaps. A gap is a range of messages that were skipped in order to send a newer message first.
 MOST_GAPS = 64
@@ -175,7 +174,7 @@ class RepeatingReceiver:
 class RowForwarder(RetryingSender):
     """Sends the messages of a spool, a folder of stored rows, to a receiver."""
 
-    log, what, slow_s = _log, "rows", SLOW_S
+    log, what = _log, "rows"
 
     def __init__(
         self, name: str, spool: Spool, receiver: RowReceiver, clock: Callable[[], float] = time.monotonic

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 from multidrop import WriteForbidden
 from multidrop.gateway.clock import iso_time
-from multidrop.gateway.commands import MOST_AGE_S, Commands
+from multidrop.gateway.commands import MOST_AGE_S, OVERTAKEN, Commands
 from multidrop.gateway.live.alarms import LOST, Alarms
 from multidrop.gateway.live.hub import Hub, KeptRow
 from multidrop.gateway.live.recent_statistics import RecentStatistics
@@ -33,7 +33,7 @@ REMEMBERED = 6
 Times = tuple[int, int]  # one moment in UTC and by CLOCK_MONOTONIC, both in ns
 MOST_AGE_NS = round(MOST_AGE_S * 1e9)
 # values of the field `rule` of WriteForbidden
-TOO_LATE, OVERTAKEN, DOUBLED = "too late", "a stop was called", "it came before"
+TOO_LATE, DOUBLED = "too late", "it came before"
 ANOTHER_PLANT = "the plant was read again"
 
 
