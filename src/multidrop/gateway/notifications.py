@@ -295,10 +295,9 @@ class Sender(RetryingSender):
 
     def _send_next(self) -> float:
         with self._changed:
-            alarm, wait_s = self._queue.next(self._clock())
+            alarm, _ = self._queue.next(self._clock())
             left_out = self._queue.left_out
-        if alarm is None:  # a newer alarm has replaced the one of this message
-            return wait_s
+        assert alarm is not None  # `step` found an alarm, and only this thread takes alarms out
         try:
             self._send(self._describe(alarm, left_out))
         except (ValueError, Refused):

@@ -356,7 +356,7 @@ MAY_STOP = '[serve.may]\nstop = "anyone"\n'
 
 
 @pytest.mark.long
-def test_a_stop_does_not_first_read_the_drives_identity(
+def test_a_stop_does_not_read_an_identity_that_is_known(
     tmp_path: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """No identity is read between the call of the stop and the Modbus request that stops the drive."""

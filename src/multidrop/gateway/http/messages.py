@@ -28,7 +28,7 @@ COMPRESSIBLE = ("text", "json", "javascript", "svg", "toml")
 LEAST_COMPRESSED = 1024  # in bytes; shorter answers are not compressed
 LEVEL = 6
 COMPRESSION_S = 10.0
-MOST_BYTES = 64 * 1024
+MOST_BYTES = 64 * 1024  # limit of a request's body
 BODY_S = 10.0
 STOP_BODY_S = 3.0  # time limit for receiving a stop's body, enough for one or two TCP retransmissions
 # a language in Accept-Language, and its weight from 0 to 1
@@ -45,7 +45,7 @@ class Denied(Exception):
 
 
 class JsonResponse(Response):
-    """A JSON response with only ASCII characters. Names from requests and files may have lone surrogates."""
+    """JSON escaped to ASCII, because names from requests and files may have lone surrogates."""
 
     media_type = "application/json"
 

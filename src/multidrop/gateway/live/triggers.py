@@ -118,7 +118,7 @@ class Triggers:
                 self._conditions = found
 
     async def close(self) -> None:
-        """Keep no triggers, which are only in memory."""
+        """Do nothing, because triggers are only in memory."""
 
     def as_answer(self) -> list[dict[str, Any]]:
         """Return the last trigger of each name for clients, the newest first.

@@ -61,9 +61,8 @@ class ModbusClient(asyncio.Protocol):
         self._is_draining = False
         # True: a request was forbidden or invalid, and the connection will be closed
         self._is_refused = False
-        self._has_ended = (
-            False  # True: the client has closed its sending direction, but may still read answers
-        )
+        # True: the client has closed its sending direction, but may still read answers
+        self._has_ended = False
         self._has_lost_answers = False
         self._stalled_since: float | None = None
         self.last_request = port.clock()

@@ -293,9 +293,8 @@ def read_identity(certificate: Path, key: Path) -> Identity:
     Raises ValueError for an unsuitable pair, OSError for an unreadable file.
     """
     secret: Any = None
-    with suppress(
-        ValueError, TypeError, UnsupportedAlgorithm
-    ):  # the library raises TypeError if the key has a password
+    # the library raises TypeError if the key has a password
+    with suppress(ValueError, TypeError, UnsupportedAlgorithm):
         found = x509.load_pem_x509_certificate(certificate.read_bytes())
         secret = load_pem_private_key(key.read_bytes(), None)
     if not isinstance(secret, RSAPrivateKey) or secret.public_key() != found.public_key():
