@@ -409,7 +409,7 @@ def test_schema_refuses_two_names_with_one_number() -> None:
         ("[[identify]]\nregister = 'device'\nis = [1]\n[[identify]]\nregister = 'dveice'\nis = [1]", False),
     ],
 )
-def test_schema_refuses_most_misspelt_names_of_registers(referring: str, is_accepted: bool) -> None:
+def test_schema_refuses_many_misspelt_names_of_registers(referring: str, is_accepted: bool) -> None:
     names = "[reading]\ndevice = { at = 1 }\nlowest = { at = 2 }\npower_of_ten = { at = 3 }\n"
     option = '[option]\nhighest = { span = [0, 50], meaning = "m" }\n'
     text = f"{FAMILIES.HEAD}{option}{names}{referring.removeprefix(FIRST_SECTION)}\n"

@@ -18,6 +18,7 @@ from multidrop.families.files.notation import DIGIT_OF_TABLE, LAST_ADDRESS
 from multidrop.families.files.registers import (
     ACCESSES,
     DEFAULT_KEYS,
+    LONGEST_NAME,
     MOST_BITS,
     MOST_REGISTERS,
     NAME,
@@ -104,28 +105,28 @@ def _each(entry: dict[str, Any], sections: Iterable[str] = ACCESSES) -> dict[str
 
 # keys of the section [family] that add registers or options
 _MORE_NAMES = ("registers", "extends", "profile")
-# keys whose value is the name of a register
+# keys whose value is the name of a register, or of an option
 _REFERENCES = "^(register|firmware|scale_register|at_least|at_most)$"
 
 
 def _references() -> dict[str, Any]:
-    """Return the JSON Schema "references" and its parts: keys such as `at_most` must name a register.
+    """Return the definition "references" and its parts: keys such as `at_most` name a register or an option.
 
-    A JSON Schema cannot look up a name, but it can compare lengths and single characters of names. A name
-    that begins with another letter than every register is misspelt. The schema compares the length, and the
-    first two and the last two characters. So it never refuses an existing name, and refuses most misspelt
-    names.
+    A JSON Schema cannot look up a name, but it can match names against patterns: those of the length, of the
+    first two and of the last two characters. If no register or option matches a pattern, no key may have a
+    name that matches it. So every existing name is accepted, and many misspelt names are refused.
     """
     letters = [f"[{small}{small.upper()}]" for small in ascii_lowercase]
     characters = [*letters, "_", *digits]
-    forms = [form.format(one) for form in ("^{}", "^.{}", "{}$", "{}.$") for one in characters]
-    forms += [f"^.{{{length}}}$" for length in range(1, 40)]
+    patterns = [form.format(one) for form in ("^{}", "^.{}", "{}$", "{}.$") for one in characters]
+    patterns += [f"^.{{{length}}}$" for length in range(1, LONGEST_NAME + 1)]
     parts: dict[str, Any] = {}
-    for number, form in enumerate(forms):
+    for number, pattern in enumerate(patterns):
         other = {"$ref": f"#/definitions/other-{number}"}
         referring: dict[str, Any] = {"patternProperties": {_REFERENCES: other}}
+        # the tables in a section, such as its registers, and those in a list such as [[identify]]
         entries = {"additionalProperties": referring, "items": referring}
-        parts[f"other-{number}"] = {"not": {"type": "string", "pattern": form}}
+        parts[f"other-{number}"] = {"not": {"type": "string", "pattern": pattern}}
         parts[f"reference-{number}"] = {
             "if": {"patternProperties": {f"^({'|'.join([*ACCESSES, 'option'])})$": {"propertyNames": other}}},
             "then": {"additionalProperties": {**referring, **entries}},
