@@ -56,7 +56,7 @@ def test_each_commands_help_describes_each_argument(run: Run, name: str) -> None
         ("hub", "seconds of samples in a commit; 10 if not given"),
         (
             "simulate",
-            "may be left out: then a share and the seed are 0, and the longest times and bursts are as",
+            "may be left out: then a rate and the seed are 0, and the longest times and bursts are as",
         ),
         ("fleet serve", "spool, logs and lock; NAME in ~/.local/state/multidrop/fleet if not given"),
         ("fleet stop", "this machine's commands; else commands.jsonl in ~/.local/state/multidrop/fleet"),

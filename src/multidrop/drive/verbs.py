@@ -1,6 +1,6 @@
-"""Verbs: a drive's commands, such as `start`.
+"""Verbs: a drive's commands, such as `start`. No I/O.
 
-A verb is a generator; the drive's bus carries out its steps.
+The script of a verb is a generator; the drive's bus carries out its steps.
 """
 
 from __future__ import annotations
@@ -38,6 +38,9 @@ MOST_UNANSWERED = 3  # limit of checks in a row without a valid reply; then `unt
 T = TypeVar("T", bound=float)
 R = TypeVar("R")
 P = ParamSpec("P")
+
+
+# ---- scripts ----
 
 
 @dataclass(frozen=True)
@@ -141,6 +144,9 @@ def until(look: Callable[[], Script[bool]], *, limit: float, every: float = 0.1)
         waited += every
 
 
+# ---- results ----
+
+
 class CommandOutcome(StrEnum):
     """The outcome of a command. It is UNKNOWN unless the effect is certain."""
 
@@ -168,6 +174,9 @@ class CommandResult(NamedTuple):
     def ok(self) -> bool:
         """True if the command was carried out; for a stop, if the motor was seen at rest."""
         return self.outcome is CommandOutcome.DONE
+
+
+# ---- verbs ----
 
 
 # Verbs that are sent only to an identified drive, and that a later stop cancels.
@@ -373,6 +382,9 @@ def verb_errors(family: Any) -> list[str]:
     ]
 
 
+# ---- verbs by name, with options from JSON ----
+
+
 def _direction(value: object) -> Direction:
     try:
         return Direction(value)
@@ -396,9 +408,8 @@ VERB_OPTIONS: Mapping[str, Mapping[str, Callable[[object], Any]]] = {
     "emergency_stop": {},
     "stop": {},
 }
-LISTED_VERBS = tuple(
-    name for name in VERB_OPTIONS if name != "stop"
-)  # verbs that the key `may` of a plant file can allow
+# verbs that the tables `may` of a plant file can allow
+LISTED_VERBS = tuple(name for name in VERB_OPTIONS if name != "stop")
 
 
 def verb_arguments(verb: str, options: Mapping[str, object]) -> dict[str, Any]:

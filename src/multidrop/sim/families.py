@@ -7,6 +7,7 @@ from collections.abc import Mapping
 
 from multidrop.core import Framing, Message
 from multidrop.drive.family import Drive
+from multidrop.drive.number_format import signed
 from multidrop.drive.register import COIL, HOLDING
 from multidrop.families.delixi import DelixiModbus, DelixiNative
 from multidrop.families.erman_er_g_220 import ErmanERG220
@@ -37,6 +38,8 @@ from multidrop.sim.profiles import (
     SimulatedYaskawa,
 )
 
+# ---- INVT CHE ----
+
 CHE_CONTROL, CHE_SETPOINT = 0x1000, 0x2000
 CHE_STARTS = range(1, 5)
 CHE_FULL = 10_000  # raw count of the setpoint 100 %
@@ -44,13 +47,10 @@ CHE_DEVICE_CODE = 0x0101  # CHE, universal
 CHE_MODBUS_FAULTS = {1: 2, 2: 4, 3: 5, 6: 8, 0x11: 3, 0x12: 6}  # value of register 5001H, by exception code
 
 
-def _signed(raw: int) -> int:
-    return raw - 0x10000 if raw & 0x8000 else raw
-
-
 class SimulatedCHE(MotorDrive):
-    """INVT CHE. The setpoint is a percentage of P0.04, the drive's option `maximum_frequency`.
+    """INVT CHE (manual, chapter 11; registers and exceptions from the CHE100 manual).
 
+    The setpoint is a percentage of P0.04, the drive's option `maximum_frequency`.
     The unit of output power is 0.01 kW, as on a CHF100A; no manual of a CHE states it.
 
     After a write to the EEPROM the drive is busy for `storing` s. The manual does not say which command ends
@@ -79,14 +79,14 @@ class SimulatedCHE(MotorDrive):
         return 1.5 * self.drive.settings.character  # CHE manual, section 11.5
 
     def setpoint(self) -> float:
-        return _signed(self.word(CHE_SETPOINT)) / CHE_FULL * self.motor.maximum_frequency
+        return signed(self.word(CHE_SETPOINT), 16) / CHE_FULL * self.motor.maximum_frequency
 
     def accept(self, cell: MemoryCell, raw: int) -> int:
         if self.now < self._busy_until:
             raise Refusal(Reason.BUSY)
         # the drive accepts negative setpoints, although multidrop sends none
         if cell.address == CHE_SETPOINT:
-            if not -CHE_FULL <= _signed(raw) <= CHE_FULL:
+            if not -CHE_FULL <= signed(raw, 16) <= CHE_FULL:
                 raise Refusal(Reason.VALUE)
             return raw
         if cell.address == CHE_CONTROL and raw in CHE_STARTS and self.motor.fault:
@@ -117,6 +117,8 @@ class SimulatedCHE(MotorDrive):
     }
 
 
+# ---- Delixi ----
+
 DELIXI_UNDER_VOLTAGE = 7  # fault number of the fault POFF
 
 DELIXI_BAUDRATES = (1200, 2400, 4800, 9600, 19200, 38400)  # baud rates, indexed by P04.28
@@ -130,7 +132,9 @@ DELIXI_BY_LINE = {DELIXI_RUN_SOURCE: 2, DELIXI_FREQUENCY_SOURCE: 1}
 
 
 class SimulatedDelixi(MotorDrive):
-    """Delixi in standard Modbus. The manual documents no exceptions: a request that fails gets no reply.
+    """Delixi 9100 and 9200 in standard Modbus (RS-485 communication protocol, part 2).
+
+    The manual documents no exceptions: a request that fails gets no reply.
 
     Assumptions beyond the document: during a fault, or unless P00.00 is 2, a run command is confirmed
     and has no effect. The setpoint is 0 unless P00.01 is 1. A start ends a jog. The longest silence
@@ -169,7 +173,9 @@ class SimulatedDelixi(MotorDrive):
 
 
 class SimulatedDelixiNative(MotorDrive):
-    """Delixi in its own protocol: replies to writes repeat the request, replies to queries have the value.
+    """Delixi in its own protocol (RS-485 communication protocol, part 3).
+
+    Replies to writes repeat the request, replies to queries have the value.
 
     While `locked` is set, writes of parameters are refused with FEH. A start during a fault is refused
     with F0H. The manual does not say what happens to a run command if P00.00 is not 2; here it is
@@ -225,6 +231,8 @@ def _printed(fault: int) -> int:
     return int(str(fault), 16)
 
 
+# ---- ERMAN ER-G-220 ----
+
 ERMAN_COILS = range(13)  # all coils, including the reserved coils 3 to 8 and 10 to 12
 ERMAN_STOP, ERMAN_EMERGENCY_STOP = 1, 2
 ERMAN_EMERGENCY_STOPPED = 1 << 0  # bit of the last fault register
@@ -233,7 +241,9 @@ ERMAN_STATES = {Phase.STOPPED: 0, Phase.CONSTANT: 1, Phase.ACCELERATING: 2, Phas
 
 
 class SimulatedERMAN(MotorDrive):
-    """ERMAN. Coils keep their state; writing START on starts the motor unless a stop coil is on.
+    """ERMAN ER-G-220-01(02) (Modbus manual v1.4, sections 5 to 8).
+
+    Coils keep their state. Writing START on starts the motor unless a stop coil is on.
 
     The manual leaves three points open. It does not say whether a coil is a level or a pulse. Here clearing
     START also stops the motor, and neither clearing a stop coil nor a reset starts it. It does not say when
@@ -295,6 +305,8 @@ class SimulatedERMAN(MotorDrive):
     }
 
 
+# ---- INNOVERT IBD ----
+
 IBD_SETPOINT = 0x2001
 # addresses of Prb.00, Prb.01 and Prb.02
 IBD_STORED_SETPOINT, IBD_FREQUENCY_SOURCE, IBD_RUN_SOURCE = 100, 101, 102
@@ -304,18 +316,16 @@ IBD_ALWAYS_SEEN = 1 << 11 | 1 << 12  # bits without a name that are 1 in the man
 IBD_LARGEST = {107: 36000, 108: 36000}  # assumed largest values of Prb.07 and Prb.08; the manual states none
 # address of the output's function Prd.nn, and the output's bit in PrA.22
 IBD_OUTPUTS = {323: 1 << 8, 324: 1 << 9, 325: 1 << 10, 328: 1 << 13}
-IBD_RUNNING, IBD_FAULT, IBD_ACCELERATING, IBD_DECELERATING = (
-    1,
-    3,
-    7,
-    8,
-)  # functions of the outputs, as set in Prd.23 to Prd.28
+# functions of the outputs, as set in Prd.23 to Prd.28
+IBD_RUNNING, IBD_FAULT, IBD_ACCELERATING, IBD_DECELERATING = 1, 3, 7, 8
 IBD_BAUDRATES = (4800, 9600, 19200, 38400)
 IBD_FORMATS = ("8N1", "8E1", "8O1")
 
 
 class SimulatedIBD(MotorDrive):
-    """INNOVERT IBD, set up for RS-485 (Prb.01 = 5, Prb.02 = 2), with outputs programmed as in the example.
+    """INNOVERT IBD (manual, part 9, appendix 2), set up for RS-485: Prb.01 = 5, Prb.02 = 2.
+
+    Its outputs are programmed as in the manual's example.
 
     The manual documents no exceptions: a request that fails gets no reply. A value above the maximum is
     stored as the maximum, but the reply repeats the written value. A run command does not end a jog; a stop
@@ -399,6 +409,8 @@ class SimulatedIBD(MotorDrive):
     }
 
 
+# ---- YD1000 ----
+
 YD_CONTROL, YD_COMMUNICATION_FREQUENCY, YD_PANEL_FREQUENCY = 0x1000, 0x1001, 0x1002
 YD_TIMEOUT_SETTING = 0x0803
 (
@@ -425,7 +437,9 @@ YD_HELD = (0x1200, 0x1201)  # addresses of the registers that are frozen from a 
 
 
 class SimulatedYD1000(MotorDrive):
-    """YD1000. Without bit 15 the panel is in control: the motor runs while `panel_runs` is set.
+    """YD1000 (communication notes, sections 4 to 8).
+
+    Without bit 15 the panel is in control: the motor runs while `panel_runs` is set.
 
     A value outside its limits in section 6 is refused, also if the limit is another parameter's value. A
     write to a parameter marked "panel only" is confirmed but not stored (6.1). This includes 0007H, although
@@ -549,9 +563,8 @@ class SimulatedYD1000(MotorDrive):
         bits = self._in_force & YD_SECOND_RAMP | (YD_REVERSE if self.motor.direction < 0 else 0)
         if not self.motor.energised:
             return bits
-        return (
-            bits | YD_RUN | self._in_force & (YD_JOG | YD_DC_BRAKE)
-        )  # YD_RUN is also set while the motor is braked with direct current (8.2, table 2)
+        # YD_RUN is also set while the motor is braked with direct current (8.2, table 2)
+        return bits | YD_RUN | self._in_force & (YD_JOG | YD_DC_BRAKE)
 
     write_handlers = {"control": _control}
     read_handlers = {

@@ -116,7 +116,7 @@ def _help(kind: type) -> str:
 
 
 HELP = (
-    "The faults' file has these lines, all of which may be left out: then a share\n"
+    "The faults' file has these lines, all of which may be left out: then a rate\n"
     "and the seed are 0, and the longest times and bursts are as here.\n"
     f"{_help(Faults)}\nA table [drive.NAME] has the faults of one drive:\n{_help(DriveFaults)}"
 )

@@ -62,9 +62,8 @@ class PtyPort:
             return b""
 
     def write(self, data: bytes) -> None:
-        with contextlib.suppress(
-            BlockingIOError
-        ):  # if no client reads, the bytes are lost, as on a real line
+        # if no client reads, the bytes are lost, as on a real line
+        with contextlib.suppress(BlockingIOError):
             os.write(self._master, data)
 
     def baudrate(self) -> int | None:
