@@ -428,7 +428,7 @@ def test_erman_identify_refuses_the_models_03_and_04_erratum_i2_e(monkeypatch: p
 
 def test_erman_byte_count_of_coils_is_rounded_up_erratum_e7() -> None:
     request = Message(1, 1, 0, 12)
-    # the printed request for 12 coils has 2 data bytes, and so does the reply
+    # the printed reply has 2 data bytes for 12 coils
     assert reply_to(request, "01 01 02 00 01 78 3C")[0] > 0
     # a reply with only 1 data byte, 12 / 8 rounded down, is rejected
     assert reply_to(request, checksums.rtu("01 01 01 00").hex())[0] <= 0

@@ -58,9 +58,9 @@ class Channel:
 
 
 class DriveSeries(NamedTuple):
-    """A drive's registers and channels.
+    """A drive's polled registers and its channels.
 
-    Each register has its unit, and the s for which its value is valid.
+    Each register has its unit, and the time in s for which its value is valid.
     """
 
     name: str

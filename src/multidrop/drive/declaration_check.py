@@ -184,7 +184,7 @@ def fact_errors(family: Any) -> list[str]:
                 wrong["options"] = (
                     f"options[{name!r}]: span = {option.span!r} is not the smallest and the largest value"
                 )
-    registers = {*family.registers, *family.texts}
+    registers = {*family.registers, *family.texts}  # errors in their names are reported elsewhere
     return [sentence for name, sentence in wrong.items() if name not in registers]
 
 

@@ -178,7 +178,7 @@ class DelixiParameters(Drive):
         )
 
     def _check_start(self) -> Script[None]:
-        """Raise WriteForbidden if the drive has a fault, has no setpoint, or does not obey the line."""
+        """Raise WriteForbidden if the drive has a fault, or does not take its commands from the line."""
         fault = yield from read(self.fault)
         if fault:
             raise WriteForbidden(
@@ -192,6 +192,9 @@ class DelixiParameters(Drive):
 
     def _is_at_rest(self) -> Script[bool]:
         return (yield from read(self.output_frequency)) == 0
+
+
+# ---- standard Modbus ----
 
 
 class DelixiModbusControl(IntEnum):
@@ -349,6 +352,9 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
         return State(Condition.RUNNING)
 
 
+# ---- Delixi's own protocol ----
+
+
 COMMAND = Table("run command", None, 0x02, Carrier.NUMBER, Kept.RAM)
 STATE = Table("run state", 0x03, None, Carrier.NUMBER)
 SETPOINT = Table("run setpoint", None, 0x04, Carrier.LONG, Kept.RAM)
@@ -369,6 +375,13 @@ class DelixiNativeStatus(IntEnum):
     REVERSE = 3
     FAULT = 4
     UNDERVOLTAGE = 5
+
+
+CONDITIONS = {
+    DelixiNativeStatus.STOPPED: (Condition.STOPPED, None),
+    DelixiNativeStatus.FORWARD: (Condition.RUNNING, Direction.FORWARD),
+    DelixiNativeStatus.REVERSE: (Condition.RUNNING, Direction.REVERSE),
+}
 
 
 class DelixiNativeFormat(IntEnum):
@@ -524,10 +537,3 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
                 Condition.FAULT, fault=self.fault.in_words(fault) if fault else self.status.in_words(status)
             )
         return State(Condition.UNKNOWN, note=f"K = 03 says {int(status):04X}H, which is not explained")
-
-
-CONDITIONS = {
-    DelixiNativeStatus.STOPPED: (Condition.STOPPED, None),
-    DelixiNativeStatus.FORWARD: (Condition.RUNNING, Direction.FORWARD),
-    DelixiNativeStatus.REVERSE: (Condition.RUNNING, Direction.REVERSE),
-}

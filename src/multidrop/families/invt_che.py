@@ -338,7 +338,7 @@ class InvtCHE(Drive):
         """
         refusals: list[DriveException] = []
         try:
-            if (yield from self._stands_by(CHEControl.STOP, refusals)):
+            if (yield from self._rests_after(CHEControl.STOP, refusals)):
                 return
         except WriteForbidden:  # the drive is of another family, so STOP_JOG could run its motor
             raise
@@ -346,13 +346,13 @@ class InvtCHE(Drive):
             with suppress(BusError):
                 yield from insist(self.control, CHEControl.STOP_JOG, attempts=1)
             raise
-        if (yield from self._stands_by(CHEControl.STOP_JOG, refusals)):
+        if (yield from self._rests_after(CHEControl.STOP_JOG, refusals)):
             return
         if len(refusals) > 1:
             raise refusals[0]
         yield from self._stopped(self._is_at_rest, self.option.get("stop_time", STOP_TIME))
 
-    def _stands_by(self, word: CHEControl, refusals: list[DriveException]) -> Script[bool]:
+    def _rests_after(self, word: CHEControl, refusals: list[DriveException]) -> Script[bool]:
         """Write a stop word; return True if the motor is then at rest. A refusal is added to `refusals`."""
         try:
             yield from insist(self.control, word)

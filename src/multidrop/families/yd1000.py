@@ -50,11 +50,12 @@ class YD1000Control(IntFlag):
 
 STOP = YD1000Control.COMMAND_VALID | YD1000Control.FREQUENCY_VALID  # only bits 15 and 14, without the run bit
 
+# the bits with the values 1, 2 and 4 in the number of the preset speed
 PRESET_SPEEDS = (
     YD1000Control.PRESET_SPEED_1,
     YD1000Control.PRESET_SPEED_2,
     YD1000Control.PRESET_SPEED_3,
-)  # the bits with the values 1, 2 and 4 in the number of the preset speed
+)
 
 
 class YD1000Status(IntFlag):
@@ -395,10 +396,11 @@ class YD1000(Drive):
 
     @verb
     def start(self, direction: Direction | None = None) -> Script[None]:
-        """Start at the setpoint 1001H. Without a direction, a turning motor keeps its direction.
+        """Start at the setpoint 1001H.
 
-        A motor at rest turns forward then. The options `preset_speed` and `setpoint_by_fnod`
-        select another setpoint, and `second_ramp` selects the second ramp. A stop always uses the first ramp.
+        Without a direction, a turning motor keeps its direction, and a resting motor turns forward. The
+        options `preset_speed` and `setpoint_by_fnod` select another setpoint, and `second_ramp` selects the
+        second ramp. A stop always uses the first ramp.
         """
         how = YD1000Control.RUN
         if self.option.get("second_ramp"):

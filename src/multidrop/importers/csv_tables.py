@@ -199,9 +199,7 @@ class _Layout:
         return {name for place, name in self._others.items() if place < len(row) and row[place].strip()}
 
     def gaps(self, cells: Cells, further: set[str]) -> list[str]:
-        """Return a sentence for each unknown property of a row, such as a column that may affect its
-        value.
-        """
+        """Return a sentence for each unknown property of a row, such as a column that may affect it."""
         columns = further & _VALUE_COLUMNS
         if _parse_tag(cells["at"]):
             columns -= {"precision"}  # the precision of a Neuron tag is only the number of digits shown

@@ -67,7 +67,7 @@ def serial_settings(
 ) -> LineSettings:
     """Return the settings of a serial line.
 
-    `keys` are the source's names of baud rate, bits, parity and stop.
+    `keys` are the keys in `given` of the baud rate, data bits, parity and stop bits.
     """
     baudrate, bits, parity, stop = (given.get(key, "") for key in keys)
     parity = _PARITIES.get(str(parity).lower(), "")

@@ -150,7 +150,7 @@ class PlantLine:
         object.__setattr__(self, "drives", tuple(self.drives))
 
     def at(self, port: str) -> PlantLine:
-        """Return a copy of the line at another port. The key `rs485` is dropped if that is a network port."""
+        """Return a copy of the line at another port, without `rs485` if the new port is a network port."""
         return replace(self, port=port, rs485=RS485.OFF if "://" in port else self.rs485)
 
 
@@ -229,7 +229,7 @@ class Plant:
 
 
 def current_for(period: float) -> float:
-    """Return how many seconds a polled value is valid.
+    """Return for how many seconds a polled value is valid.
 
     `period` in s is the register's own period or the line's bus cycle, whichever is longer.
     """
@@ -327,7 +327,7 @@ def _listed(plant: Plant, key: str, entry: object) -> list[str]:
     """Return the registers or verbs, as "drive.name", that an entry such as "pump-*.start" allows.
 
     `*` stands for any characters of a drive's name. Drives without the register or verb are skipped. Raises
-    ValueError for a wrong entry.
+    ValueError if no drive has it, or if the entry has another mistake.
     """
     name, dot, rest = entry.rpartition(".") if isinstance(entry, str) else ("", "", "")
     if not dot:

@@ -15,9 +15,8 @@ DIGIT_OF_TABLE = {table: digit for digit, table in _TABLE_OF_DIGIT.items()}
 LAST_ADDRESS = 0xFFFF
 
 _HEX = re.compile(r"0[xX]([0-9a-fA-F]{1,8})|([0-9a-fA-F]{1,8})[hH]")
-_NUMBERED = re.compile(
-    r"[0134](\d{4}|\d{5})", re.ASCII
-)  # addresses such as 40001 or 400001: a digit for the table, then a number from 1
+# addresses such as 40001 or 400001: a digit for the table, then a number from 1
+_NUMBERED = re.compile(r"[0134](\d{4}|\d{5})", re.ASCII)
 _EXPONENT = re.compile(r"\d+([.]\d+)?[eE][+-]?\d+", re.ASCII)
 
 

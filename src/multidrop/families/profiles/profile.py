@@ -31,8 +31,7 @@ _CODED = "what the profile itself says; leave it out"
 class Role:
     """A register that a profile uses, such as `control`; the profile sets its `values` and `harmless`.
 
-    `needed` is False if a family may omit the register. `extra` names bits that a family may add to `values`,
-    because makes differ in these bits.
+    `needed` is False if a family may omit the register.
     """
 
     access: tuple[Access, ...]

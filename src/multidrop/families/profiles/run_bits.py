@@ -11,6 +11,8 @@ from multidrop.drive.state import Direction
 from multidrop.drive.verbs import Script
 from multidrop.families.profiles.profile import COMMON, Profile, Role
 
+# ---- Danfoss FC ----
+
 
 class DanfossControl(IntFlag):
     """The control word CTW (FC 300 design guide MG.33.B6, p. 277; FC 51 manual p. 29, coils 1 to 16)."""
@@ -48,6 +50,8 @@ class DanfossStatus(IntFlag):
 
 class DanfossFC(Profile):
     """Danfoss FC profile: the motor runs while bit 6 is 1; bit 15 reverses; a rising bit 7 resets.
+
+    The VLT and iC2 drives have this control word.
 
     - Bit 6 acts by its level: a drive that is reset while bit 6 is set starts immediately. So a stop is
       confirmed before a reset, and no word has both bits.
@@ -101,6 +105,9 @@ class DanfossFC(Profile):
         return self.start_word | (DanfossControl.REVERSE if direction is Direction.REVERSE else 0)
 
 
+# ---- Optidrive E3 ----
+
+
 class OptidriveControl(IntFlag):
     """The control word, register 1 (ODE-3 user guide 1.00, p. 33). An Optidrive Plus swaps bits 1 and 2."""
 
@@ -135,6 +142,8 @@ OPTIDRIVE_RESERVED = 0x9C  # bits 2, 3, 4 and 7 of the low byte
 
 class Optidrive(Profile):
     """Optidrive E3: the motor runs while bit 0 of the control word is 1; bit 2 resets, bit 3 coasts.
+
+    Its maker is Invertek; it is also sold under other names.
 
     - An Optidrive Plus 3GV has bit 1 for the reset and bit 2 for the second ramp. Bit 1 is never sent.
     - The first guide (1.00) prints the two bytes of register 6 in the opposite order to later guides. A start
@@ -185,11 +194,11 @@ class Optidrive(Profile):
         return self.start_word
 
 
-class YaskawaControl(IntFlag):
-    """The control word at 0001H (A1000 manual SIEP C710616 27G, p. 559).
+# ---- Yaskawa ----
 
-    The bit "external fault" is not sent.
-    """
+
+class YaskawaControl(IntFlag):
+    """The control word 0001H (A1000 manual SIEP C710616 27G, p. 559). Bit 2, external fault, is not sent."""
 
     FORWARD = 1 << 0
     REVERSE = 1 << 1
@@ -219,6 +228,8 @@ class YaskawaStatus(IntFlag):
 
 class Yaskawa(Profile):
     """Yaskawa: bit 0 runs the motor forward, bit 1 in reverse, while the bit is 1; bit 3 resets.
+
+    The A1000, V1000 and other drives of the 1000 series have these registers.
 
     - Bits 0 and 1 are those of H5-12 = 0, the factory setting. With H5-12 = 1 bit 1 is the direction, and a
       start in reverse has no effect: `start` raises NotVerified.
