@@ -1,6 +1,4 @@
-"""Delixi's own protocol: the register tables, and the frames of verbs, as printed in part 3 of the
-document.
-"""
+"""Delixi's own protocol: the register tables, and the frames of verbs, as part 3 of the document has them."""
 
 from __future__ import annotations
 

@@ -152,9 +152,7 @@ def test_che_jog_is_refused_if_the_motor_may_turn(
 
 @table("direction", [None, *Direction])
 def test_che_start_is_refused_in_an_undocumented_state(direction: Direction | None) -> None:
-    """The manual documents the values 1 to 4 of 1001H. With another value, the motor may turn the other
-    way.
-    """
+    """The manual documents the values 1 to 4 of 1001H. With others, the motor may turn the other way."""
     wire = Wire(InvtCHE(1), {**STANDBY, "status": 5})
     with pytest.raises(WriteForbidden, match="has 0005H at 1001H, a state that the manual does not explain"):
         wire.drive.start(direction)

@@ -1,6 +1,4 @@
-"""Wrong declarations: a drive is declared as a family that commands motors, but another family's drive
-is connected.
-"""
+"""Wrong declarations: a drive is declared as a family that commands motors, but is of another family."""
 
 from __future__ import annotations
 

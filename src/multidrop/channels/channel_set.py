@@ -248,10 +248,10 @@ class ChannelSet:
     # ---- totals ----
 
     def take_over(self, before: ChannelSet, replaced: Collection[str] = ()) -> None:
-        """Continue the totals of channels that `before`, an earlier set, has with equal expression and units.
+        """Continue the totals of channels that `before` also has, with the same expression and units.
 
-        `replaced` are names that now belong to other drives. For functions with a memory, an outage
-        lies between the last value of the old drive and the first value of the new drive.
+        `before` is an earlier set. `replaced` are names that now belong to other drives. For functions with
+        a memory, an outage lies between the last value of the old drive and the first value of the new drive.
         """
         known = {(one.name, one.channel, *one.program.units): one for one in before._computed}
         for one in self._computed:

@@ -95,7 +95,7 @@ def _wrong_facts(owner: Any, rules: Rules) -> dict[str, str]:
     }
 
 
-# ---- facts of a class other than its registers ----
+# ---- attributes of a class other than its registers ----
 
 _TIMES = {
     "silence": LONGEST_SILENCE,
@@ -198,7 +198,7 @@ def text_errors(texts: Mapping[str, Text], taken: Collection[str]) -> list[str]:
     ]
 
 
-# ---- a register, each fact by itself ----
+# ---- a register: each attribute by itself ----
 
 
 def _or_none(right: Callable[[Any], bool]) -> Callable[[Any], bool]:
@@ -261,7 +261,7 @@ _REGISTER_RULES: Rules = (
 )
 
 
-# ---- a register: facts that must fit together ----
+# ---- a register: attributes that must fit together ----
 
 
 def _errors_together(

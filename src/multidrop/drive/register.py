@@ -531,6 +531,9 @@ def _extra(register: Register[Any], at: int) -> Extra | None:
     )
 
 
+# ---- titles in other languages ----
+
+
 LANGUAGES = ("ru", "zh")  # languages of the catalogue, besides English
 ENGLISH = "en"
 _CODE = re.compile(r"[A-Za-z]{2}(?![A-Za-z])")  # finds the language in a tag such as ru-RU or ru_RU.UTF-8

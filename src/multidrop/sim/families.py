@@ -576,6 +576,9 @@ class SimulatedYD1000(MotorDrive):
     }
 
 
+# ---- the class for each family ----
+
+
 FAMILIES: Mapping[type[Drive], type[SimulatedDrive]] = {
     ErmanERG220: SimulatedERMAN,
     InvtCHE: SimulatedCHE,

@@ -1,6 +1,4 @@
-"""Load families from files: the resulting class, and a sentence with place and correction for every
-mistake.
-"""
+"""Load families from files: the resulting class; every mistake is reported with its place and correction."""
 
 from __future__ import annotations
 

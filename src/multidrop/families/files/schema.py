@@ -251,7 +251,7 @@ def _with_profile(name: str, roles: Mapping[str, Role]) -> dict[str, Any]:
 def _of_roles(roles: Mapping[str, Role]) -> dict[str, Any]:
     """Return the schema of a section such as [reading] in a family file with a profile.
 
-    `roles` are the profile's registers in this section.
+    `roles` are the registers that the profile uses, in any section.
     """
     return {
         "properties": {role: _of_role(role, roles[role]) for role in roles},
