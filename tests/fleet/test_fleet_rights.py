@@ -204,7 +204,7 @@ def test_secret_files_are_readable_only_by_their_owner(as_written: SecuredCluste
 
 
 def test_adding_a_gateway_keeps_all_existing_keys(tmp_path: Path) -> None:
-    from multidrop.fleet.servers.rights import write_files
+    from multidrop.fleet.servers.files import write_files
 
     urls = ["nats://a:4222", "nats://b:4222"]
 

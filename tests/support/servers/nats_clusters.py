@@ -21,7 +21,7 @@ from namespaces import Namespace
 from peers import require_program
 
 from multidrop.fleet.servers.connections import ServerPath, paths_of
-from multidrop.fleet.servers.rights import PINGS
+from multidrop.fleet.servers.files import PINGS
 
 PATIENCE_S = 60.0
 ATTEMPTS = 4

@@ -16,7 +16,7 @@ from multidrop.cli.support.output import print_json, print_text, warn
 if TYPE_CHECKING:
     from multidrop.fleet.servers.buckets import Record
     from multidrop.fleet.servers.connections import ServerPath
-    from multidrop.fleet.servers.rights import TlsFiles
+    from multidrop.fleet.servers.files import TlsFiles
 
 FOLDER = Path("nats")
 KEEP = "10 GB"
@@ -56,7 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _rights(arguments: argparse.Namespace) -> int:
     """Write the files, and print on which computer each belongs. Secrets are never printed."""
     require_extra("nkeys", "fleet", "fleet rights")
-    from multidrop.fleet.servers.rights import write_files
+    from multidrop.fleet.servers.files import write_files
 
     gateways = [name.strip() for name in arguments.gateways.split(",") if name.strip()]
     if not gateways:
@@ -78,7 +78,7 @@ def _rights(arguments: argparse.Namespace) -> int:
 
 
 def _tls(arguments: argparse.Namespace, urls: Sequence[str]) -> TlsFiles | None:
-    from multidrop.fleet.servers.rights import TlsFiles
+    from multidrop.fleet.servers.files import TlsFiles
 
     files = (arguments.cert, arguments.key, arguments.ca)
     secure = next((url for url in urls if url.startswith("tls:")), "TLS" if any(files) else None)

@@ -29,7 +29,8 @@ if TYPE_CHECKING:
     from multidrop.fleet.overview import FleetWatch
     from multidrop.fleet.servers.connections import ServerPath
 
-EVERY_S = 1.0
+FleetState = Mapping[str, Any]  # a fleet's state, as `--json` prints it
+EVERY_S = 1.0  # pause between two pictures of `watch`
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -218,7 +219,6 @@ def _cut(text: str, width: int) -> str:
 # ---- tables and sentences ----
 
 
-FleetState = Mapping[str, Any]  # a fleet's state, as `--json` prints it
 GATEWAYS = (
     "GATEWAY",
     "HOST",

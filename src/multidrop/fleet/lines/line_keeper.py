@@ -98,8 +98,7 @@ class LineKeeper:
         self.lines = lines
         self.polled: dict[str, TakenLine] = {}
         self.troubles: dict[str, str] = {}  # by line: why the line could not be opened
-        # how the port was lost, by line; only lines that are no longer polled
-        self.lost: dict[str, str] = {}
+        self.lost: dict[str, str] = {}  # by line: how its port was lost, or why it cannot be opened
         self.unopened = UnopenedLines(lambda: lease.clock())
         self.releasing: set[str] = set()  # this gateway's lines that it must release to other gateways
         self.may_claim = True  # False while a gateway of an incompatible version is alive

@@ -50,7 +50,7 @@ class FleetRecords:
         self._of: dict[str, dict[str, Record | None]] = {}  # ownership records, by line and bucket
         # lines that have an ownership record of a session, by session
         self._owned: dict[Owner, set[str]] = {}
-        self._masters: dict[str, tuple[str, int]] = {}  # by line: its master and the number of its moves
+        self._masters: dict[str, tuple[str, int]] = {}  # by line: its master, and the turn of its records
         self.plant = Follower(Bucket(names.PLANT, path), self._note_plant)
         self._has_plant_changed = False
         self._lines: tuple[str, ...] = ()
