@@ -21,9 +21,11 @@ from multidrop import poller as poller_module
 from multidrop.core import Framing, Message, build_reply, parse_request
 from multidrop.drive import Drive
 from multidrop.drive.register import HOLDING, reading
+from multidrop.drive.verbs import CommandOutcome
 from multidrop.errors import LineError, PollingFailed
 from multidrop.families import InvtCHE
 from multidrop.poller import Poller
+from multidrop.polling import polled_line
 from multidrop.polling.batch import Row
 from multidrop.polling.polled_line import MOST_AT_ONCE, PolledLine
 from multidrop.sim import Faults, MotorDrive, Simulator, Wire, simulated
@@ -142,7 +144,7 @@ def test_a_stop_reopens_a_lost_port_after_the_poller_has_failed(
 def server(
     is_last: Callable[[int, int], bool], idle_s: float | None = None, closes: list[bytes] | None = None
 ) -> Iterator[str]:
-    """Serve Modbus TCP to one client at a time. The value of each register is its address.
+    """Serve Modbus TCP to one client at a time. Reads return the register's address; writes are echoed.
 
     The server closes a connection after its nth request if `is_last(nth, address)` is True, or if no request
     comes for `idle_s` s. It closes the connection without a reply if the address is `DEADLY`. When it closes
@@ -155,8 +157,8 @@ def server(
                 _, request = parse_request(Framing.TCP, connection.recv(64))
                 if request is None or request.start == DEADLY:
                     return
-                reply = Message(1, 3, data=request.start.to_bytes(2), transaction=request.transaction)
-                connection.sendall(build_reply(Framing.TCP, reply))
+                read = Message(1, 3, data=request.start.to_bytes(2), transaction=request.transaction)
+                connection.sendall(build_reply(Framing.TCP, read if request.function == 3 else request))
                 if is_last(nth, request.start):
                     return
 
@@ -248,6 +250,24 @@ def test_values_of_a_server_that_closes_each_connection_at_once_are_misses() -> 
 
             until(look)
     assert {row.status for row in rows} <= {"port lost", "reply cut short"}
+
+
+class Fragile(Toy):
+    framings = (Framing.TCP,)
+    formats = {Framing.TCP: ("8N1",)}
+    deadly = reading(DEADLY)
+
+
+def test_a_stop_does_not_wait_until_the_poller_reopens_a_port_that_is_lost_often(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(polled_line, "REOPEN_NS", 3_600_000_000_000)
+    with server(lambda nth, address: False) as port:
+        drive = Fragile(1, name="pump")
+        with Poller(plant(line(port, polled(drive, [Fragile.deadly])))) as poller:
+            losing = poller._lines.find("line")
+            until(lambda: losing._losses > MOST_AT_ONCE)
+            assert drive.stop(seconds=20).outcome is CommandOutcome.DONE
 
 
 def test_a_port_that_is_lost_at_every_request_is_reopened_twice_a_second(tmp_path: Path) -> None:

@@ -486,6 +486,8 @@ class PolledLine:
         self._losses += 1
         if self._losses <= MOST_AT_ONCE:
             self._reopen_ns = now_ns
+        else:
+            self.bus.tended(False)  # stops reopen the port themselves until the next attempt
 
     def _regain(self, now_ns: int) -> None:
         """Reopen the port in a thread; until that succeeds, add a miss row for each value that is due.
