@@ -1,4 +1,7 @@
-"""Simulated drives of the built-in families. Each class follows the manual that it names."""
+"""Simulated drives of the built-in families, and `simulated`, which chooses the class for a drive.
+
+Each class follows the manual that it names.
+"""
 
 from __future__ import annotations
 
@@ -13,30 +16,11 @@ from multidrop.families.delixi import DelixiModbus, DelixiNative
 from multidrop.families.erman_er_g_220 import ErmanERG220
 from multidrop.families.innovert_ibd import InnovertIBD
 from multidrop.families.invt_che import InvtCHE
-from multidrop.families.profiles import (
-    CiA402,
-    DanfossFC,
-    Delta,
-    Inovance,
-    Invt,
-    Optidrive,
-    Profidrive,
-    Yaskawa,
-)
 from multidrop.families.yd1000 import YD1000
 from multidrop.sim.drive import COMMAND, GAPS, MODBUS, SET, STORE, Reason, Refusal, SimulatedDrive
 from multidrop.sim.memory import MemoryCell, decode
 from multidrop.sim.motor import MotorDrive, Phase
-from multidrop.sim.profiles import (
-    SimulatedCiA402,
-    SimulatedDanfossFC,
-    SimulatedDelta,
-    SimulatedInovance,
-    SimulatedInvt,
-    SimulatedOptidrive,
-    SimulatedProfidrive,
-    SimulatedYaskawa,
-)
+from multidrop.sim.profiles import PROFILE_DRIVES
 
 # ---- INVT CHE ----
 
@@ -586,14 +570,7 @@ FAMILIES: Mapping[type[Drive], type[SimulatedDrive]] = {
     DelixiModbus: SimulatedDelixi,
     DelixiNative: SimulatedDelixiNative,
     YD1000: SimulatedYD1000,
-    Profidrive: SimulatedProfidrive,
-    CiA402: SimulatedCiA402,
-    DanfossFC: SimulatedDanfossFC,
-    Delta: SimulatedDelta,
-    Inovance: SimulatedInovance,  # listed before its base class Invt, so that it is found first
-    Invt: SimulatedInvt,
-    Optidrive: SimulatedOptidrive,
-    Yaskawa: SimulatedYaskawa,
+    **PROFILE_DRIVES,
 }
 
 

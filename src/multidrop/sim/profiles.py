@@ -2,29 +2,37 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
+from multidrop.drive.family import Drive
 from multidrop.families.profiles.delta import (
     FORWARD,
     REVERSE,
     RUNNING,
     STOPPED,
     STOPPING,
+    Delta,
     DeltaReset,
     DeltaStatus,
 )
 from multidrop.families.profiles.iec_61800_7 import (
+    CiA402,
     CiA402Control,
     CiA402Status,
+    Profidrive,
     ProfidriveControl,
     ProfidriveStatus,
 )
-from multidrop.families.profiles.invt import InovanceStatus, InvtControl, InvtStatus
+from multidrop.families.profiles.invt import Inovance, InovanceStatus, Invt, InvtControl, InvtStatus
 from multidrop.families.profiles.run_bits import (
     DanfossControl,
+    DanfossFC,
     DanfossStatus,
+    Optidrive,
     OptidriveControl,
     OptidriveStatus,
+    Yaskawa,
     YaskawaControl,
     YaskawaStatus,
 )
@@ -444,3 +452,16 @@ class SimulatedOptidrive(ProfileDrive):
 
     write_handlers = {"control": _control}
     read_handlers = {"status": _state}
+
+
+# by profile: the class that simulates its drives
+PROFILE_DRIVES: Mapping[type[Drive], type[ProfileDrive]] = {
+    Profidrive: SimulatedProfidrive,
+    CiA402: SimulatedCiA402,
+    DanfossFC: SimulatedDanfossFC,
+    Delta: SimulatedDelta,
+    Inovance: SimulatedInovance,  # listed before its base class Invt, so that it is found first
+    Invt: SimulatedInvt,
+    Optidrive: SimulatedOptidrive,
+    Yaskawa: SimulatedYaskawa,
+}
