@@ -31,14 +31,14 @@ from multidrop.fleet import gateway as fleet_gateway
 from multidrop.fleet import metrics
 from multidrop.fleet.commands.desk import CommandSubjects
 from multidrop.fleet.commands.fleet_commands import FleetCommands
-from multidrop.fleet.commands.messages import CommandLog
+from multidrop.fleet.commands.log import CommandLog
 from multidrop.fleet.gateway import CommandedLines, FleetGateway, FleetLines
 from multidrop.fleet.samples import forwarder as forwarder_module
 from multidrop.fleet.samples import parquet_sink
 from multidrop.fleet.samples.forwarder import Forwarder
 from multidrop.fleet.servers import names
 from multidrop.samples import spool as spool_module
-from multidrop.samples.message import PolledUnits
+from multidrop.samples.polled_units import PolledUnits
 from multidrop.samples.spool import Spool
 from multidrop.sim import Simulator, Wire, simulated
 from multidrop.supervisor import Ended, end_tasks, supervisor

@@ -28,14 +28,8 @@ from multidrop.control import CommandOutcome, Seen, read_audit, records
 from multidrop.control.commands import RepeatedStops, Results, begin_stops, stop_drive, stop_line
 from multidrop.fleet.commands import desk as desk_module
 from multidrop.fleet.commands.desk import MOST_WRITES
-from multidrop.fleet.commands.messages import (
-    CommandAnswer,
-    CommandLog,
-    CommandRequest,
-    Offered,
-    read_answer,
-    read_offer,
-)
+from multidrop.fleet.commands.log import CommandLog
+from multidrop.fleet.commands.messages import CommandAnswer, CommandRequest, Offered, read_answer, read_offer
 from multidrop.fleet.commands.offers import prepare
 
 DONE, REFUSED, NOT_SENT, UNKNOWN = (
@@ -567,7 +561,7 @@ def test_an_offer_does_not_change_the_known_setpoint() -> None:
 HANGING_LOG = """
 import asyncio, sys, threading
 from pathlib import Path
-from multidrop.fleet.commands.messages import CommandLog
+from multidrop.fleet.commands.log import CommandLog
 
 async def main():
     log = CommandLog(Path(sys.argv[1]))
@@ -583,7 +577,7 @@ import asyncio, sys, threading
 from pathlib import Path
 from multidrop.core import Mastership
 from multidrop.fleet.gateway import FleetLines
-from multidrop.samples.message import PolledUnits
+from multidrop.samples.polled_units import PolledUnits
 
 async def main():
     lines = FleetLines(Mastership(), Path(sys.argv[1]).parent, PolledUnits())

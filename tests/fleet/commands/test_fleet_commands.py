@@ -288,7 +288,7 @@ def test_a_full_disk_blocks_commands_but_not_stops(tmp_path: Path) -> None:
         raise OSError(28, "No space left on device")
 
     path = ScriptedPath(cmd=[OFFER], do=[IT_IS_DONE], stop=[IT_IS_DONE])
-    with patch("multidrop.fleet.commands.messages.CommandLog._add", full):
+    with patch("multidrop.fleet.commands.log.CommandLog._add", full):
         told = asked(tmp_path, path, write)
         assert told.outcome is NOT_SENT
         assert "asked.jsonl: No space left on device" in told.text

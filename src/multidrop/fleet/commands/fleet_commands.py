@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any, Self
 
 from multidrop.control import CommandOutcome
+from multidrop.fleet.commands.log import CommandLog
 from multidrop.fleet.commands.messages import (
     UNNAMED,
     CommandAnswer,
-    CommandLog,
     CommandRequest,
     Offered,
     StopRequest,

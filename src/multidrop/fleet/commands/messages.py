@@ -1,25 +1,18 @@
-"""JSON messages for commands (requests, offers and answers), and the log of each command's steps."""
+"""JSON messages for commands: requests, offers and answers. This module does no I/O."""
 
 from __future__ import annotations
 
-import asyncio
 import json
-import threading
-import time
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from sys import float_info
 from typing import Any, NamedTuple
 
-from multidrop.control import AuditLog, CommandOutcome, CommandResult, with_name
+from multidrop.control import CommandOutcome, CommandResult, with_name
 from multidrop.printable import is_number
-from multidrop.supervisor import supervisor
 
 MOST_BYTES = 64 * 1024  # limit of a message's size in bytes
 MOST_CHARACTERS = 200  # limit of a name's, an id's or a value's length
 UNNAMED = "somebody"  # name of a stop's sender if the message has no name
-WRITING_S = 10.0  # time limit for writing a record; after it, the disk is reported as hanging
-CLOSING_S = 1.0  # how long, in s, `close` waits for the record that is being written
 
 
 class CommandAnswer(NamedTuple):
@@ -216,56 +209,3 @@ def worst(answers: Sequence[CommandAnswer]) -> CommandOutcome:
         CommandOutcome.DONE,
     )
     return min((answer.outcome for answer in answers), key=order.index, default=CommandOutcome.REFUSED)
-
-
-class CommandLog:
-    """A file with one line of JSON for each step of a command.
-
-    `note` returns once its line is on the disk, so that a caller can log a step before taking it. Each record
-    is written in its own daemon thread, so a disk that hangs blocks neither the event loop nor the exit of
-    the process.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._log: AuditLog | None = None
-        self._turn = asyncio.Lock()  # writes records in the order of the calls
-        self._writing = threading.Lock()
-        self._is_closed = False
-
-    def open(self) -> AuditLog:
-        """Open the file unless it is open. Raises OSError."""
-        if self._log is None:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._log = AuditLog(self.path)
-        return self._log
-
-    async def note(self, record: Mapping[str, Any]) -> None:
-        """Append a record with the time of day (UTC), and return once it is synced to the disk.
-
-        Raises OSError if that fails, if the log is closed, or if the system cannot start a thread.
-        """
-        now_ns = time.time_ns()
-        async with self._turn:
-            if self._is_closed:
-                raise OSError(f"{self.path} is closed")
-            try:
-                await supervisor().thread("command log", WRITING_S, lambda: self._add(record, now_ns))
-            except OSError:
-                raise
-            except Exception as failure:  # the thread that writes the record did not start, or failed
-                raise OSError(f"{self.path}: {type(failure).__name__}: {failure}") from failure
-
-    def _add(self, record: Mapping[str, Any], now_ns: int) -> None:
-        with self._writing:
-            log = self.open()
-            log.add(now_ns, dict(record))
-            log.sync()
-
-    def close(self) -> None:
-        """Wait until the record in progress is written, then close the file; later records are refused."""
-        self._is_closed = True
-        if self._writing.acquire(timeout=CLOSING_S):
-            if self._log:
-                self._log.close()
-            self._writing.release()
