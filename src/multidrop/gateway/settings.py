@@ -1,6 +1,6 @@
 """The table `[serve]` of a plant file, and the files that the table names.
 
-All mistakes are found at the start.
+All mistakes are reported before the gateway starts.
 """
 
 from __future__ import annotations

@@ -157,7 +157,7 @@ def test_unknown_addresses_silent_drives_and_broadcasts_are_not_answered(rig: Ri
     assert rig.commands.stopped == []
 
 
-def test_a_drive_without_modbus_and_an_unknown_function_answer_exception_01(rig: Rig, tool: int) -> None:
+def test_a_drive_without_modbus_and_an_unknown_function_get_exception_01(rig: Rig, tool: int) -> None:
     assert code(tool, "04 03 00 10 00 02") == 1
     assert code(tool, "01 41 01 02 03") == 1
     assert code(tool, "01 08 00 04 00 00") == 1  # "force listen only mode", which would silence a drive

@@ -40,8 +40,8 @@ class Publication(NamedTuple):
 class Outbox:
     """Messages that wait to be sent, at most one per topic, and the messages that await acknowledgement.
 
-    The second number is limited. `send` takes a message and returns its number, or None if it cannot be sent
-    now.
+    At most MOST_UNDER_WAY messages await acknowledgement. `send` takes a message and returns its number, or
+    None if it cannot be sent now.
     """
 
     def __init__(self, send: Callable[[Publication], int | None]) -> None:

@@ -186,8 +186,7 @@ class _Drive(NamedTuple):
 
 
 class PlantNodes:
-    """The nodes of a plant: an object for the plant, in it one for each drive, in that a variable for each
-    register.
+    """The object of the plant, and in it an object for each drive, with a variable for each polled register.
 
     All methods must be called in the event loop of the OPC UA server.
     """

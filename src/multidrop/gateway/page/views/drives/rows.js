@@ -8,7 +8,7 @@ import { STATES, UNKNOWN, makeUse, makeValue, share, showUse, showValue } from "
 
 export const COLUMNS = 8;
 const MANY = 0.01; // share of failed reads from which a warning is shown
-const FULL_HZ = [50, 60, 80, 100, 150, 200, 300, 400, 600, 1000, 2000, 4000]; // at which a bar may be full
+const FULL_HZ = [50, 60, 80, 100, 150, 200, 300, 400, 600, 1000, 2000, 4000]; // frequencies of a full bar
 
 // Return a line's row and the elements in it that change. A click on the line's name calls `unfold`, unless
 // it is null.
