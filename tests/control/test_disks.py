@@ -17,7 +17,6 @@ from interruptions import full_at, read_only_directory
 from simulated_bus import SimulatedBus, one
 
 from multidrop.cli import main
-from multidrop.control import records
 from multidrop.control import records as write_records
 from multidrop.control.eeprom_ledger import Ledger, LedgerCell
 from multidrop.control.outcome import Effect
@@ -233,7 +232,7 @@ def test_opening_the_audit_log_on_a_hung_disk_times_out(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     answers = threading.Event()
-    monkeypatch.setattr(records, "OPENING_S", 0.05)
+    monkeypatch.setattr(write_records, "OPENING_S", 0.05)
     monkeypatch.setattr(Path, "open", lambda *details, **options: answers.wait(PATIENCE_S))
     with pytest.raises(OSError, match=r"audit log: not done within 0\.05 s; does the disk answer\?"):
         AuditLog(tmp_path / "audit.jsonl")

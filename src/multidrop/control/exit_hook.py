@@ -21,12 +21,11 @@ from queue import SimpleQueue
 from types import FrameType
 from typing import Any
 
-from multidrop.core.process import register_at_fork
+from multidrop.core.process import HANDLING_S, register_at_fork
 from multidrop.errors import BusError
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 IMPATIENT = 3  # this many signals within a second end the wait for the stops
-HANDLING_S = 0.05  # s; longest delay in handling a signal that the kernel gave to another thread
 PACKAGE = __name__.partition(".")[0]
 MOST_NAMES = 20  # limit of the drives that a message names
 CUT_SHORT = "the stops were cut short by a third signal: motors may still be turning"

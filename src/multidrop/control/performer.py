@@ -32,7 +32,10 @@ class _Over(Exception):
 
 
 class Performer:
-    """Carries out the scripts of verbs on one bus. A write expires if it is not sent within `expiry` s."""
+    """Carries out the scripts of verbs on one bus.
+
+    A write expires if it cannot be sent within `expiry` seconds of its call.
+    """
 
     def __init__(
         self, exchanges: Exchanges, writer: Writer, stopper: Stopper, latches: Latches, expiry: float

@@ -86,9 +86,9 @@ class BackOff:
 
     A silent drive rests (gets no request) for longer each time. After each rest it gets its shortest request,
     in spare time or in the line time of jobs without a period. All silent drives together take only a small
-    share of the line. Only the first rest of a drive that has answered before is short in any case, because
-    the drive may have missed two requests by chance. When a silent drive replies, its rests end. The next
-    silent drive is then tried immediately, because both may have been without power.
+    share of the line. But the first rest of a drive that has answered before is always short, because the
+    drive may have missed two requests by chance. When a silent drive replies, its rests end. The next silent
+    drive is then tried immediately, because both may have been without power.
 
     A new drive, which has never answered, gets one request and no other until the outcome is known; without a
     reply it rests immediately. Once all new drives have had their first request, the silent ones get a second
@@ -121,7 +121,7 @@ class BackOff:
         return health.rest_ns > 0 or at_ns < max(health.asleep_until_ns, health.late_until_ns)
 
     def wake(self, at_ns: int) -> int | None:
-        """Return a drive that may get a request again, and start its next pause; None if there is none."""
+        """Return a drive whose rest is over, and start its next rest; None if there is no such drive."""
         for drive, health in self.health.items():
             if health.rest_ns and at_ns >= health.asleep_until_ns and not health.is_pending:
                 health.asleep_until_ns = at_ns + health.rest_ns
@@ -173,11 +173,11 @@ class BackOff:
         health.asleep_until_ns = max(health.late_until_ns, now_ns + rest_ns)
 
     def _fair_rest_ns(self) -> int:
-        """Return the pause in ns that keeps requests to all silent drives within SILENT_SHARE."""
+        """Return the rest in ns that keeps requests to all silent drives within SILENT_SHARE."""
         return round(sum(health.cost_ns for health in self.health.values() if health.rest_ns) / SILENT_SHARE)
 
     def _wake_next(self, drive: int, now_ns: int) -> None:
-        """Let the silent drive whose pause ends next be tried now, because this drive answers again."""
+        """Let the silent drive whose rest ends next be tried now, because this drive answers again."""
         resting = [health for number, health in self.health.items() if health.rest_ns and number != drive]
         if resting:
             first = min(resting, key=lambda health: health.asleep_until_ns)

@@ -98,7 +98,7 @@ GONE = "its line is no longer polled"
 
 
 class KeptLine:
-    """A line that stays, with its open port; its new description; and the changes of its drives."""
+    """A line that keeps its open port, with its new description and the changes of its drives."""
 
     def __init__(self, line: PolledLine, wanted: PlantLine) -> None:
         self.line = line
