@@ -206,9 +206,8 @@ def test_prometheus_scrapes_each_second_and_values_of_a_silent_drive_are_stale(t
         jobs = JOBS.format(port=gateway.gateway.port, secret=gateway.secrets[Right.LOOK])
         with scraping(tmp_path, jobs) as prometheus:
             until(lambda: drives(prometheus) == {"pump-1", "pump-2"})
-            until(
-                lambda: prometheus.targets()["stranger"][0] != "unknown"
-            )  # Prometheus has tried this target
+            # wait until Prometheus has tried this target
+            until(lambda: prometheus.targets()["stranger"][0] != "unknown")
             assert prometheus.targets() == {
                 "known": ("up", ""),
                 "stranger": ("down", "server returned HTTP status 401 Unauthorized"),

@@ -148,9 +148,8 @@ def test_values_polled_before_a_write_are_not_used_after_it(gateway: Gateway) ->
     gateway.hub.ages["mill", "output_voltage"] = 0.2
     with gateway.client() as client:
         assert client.ask(1, 6, CHE_SETPOINT, 5000).code is None
-        assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [
-            CHE_OUTPUT_VOLTAGE
-        ]  # read from the drive, not taken from polled values
+        # read from the drive, not taken from polled values
+        assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [CHE_OUTPUT_VOLTAGE]
         gateway.hub.ages["mill", "output_voltage"] = 0.0
         assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [231]
 
@@ -162,9 +161,8 @@ def test_values_polled_before_a_command_are_not_used_after_a_reload(gateway: Gat
         assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [231]
         gateway.commands.ended["mill"] = time.monotonic_ns()
         gateway.server.adopt(plant())
-        assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [
-            CHE_OUTPUT_VOLTAGE
-        ]  # read from the drive, not taken from polled values
+        # read from the drive, not taken from polled values
+        assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [CHE_OUTPUT_VOLTAGE]
 
 
 @table("function", [1, 2, 3, 4])

@@ -79,20 +79,16 @@ def test_no_topic_is_deleted_while_another_gateway_uses_the_prefix() -> None:
         ("works/a/b/available", b"online"),
         ("workshop/old/available", b"online"),
         ("elsewhere/old/available", b"online"),
-        (
-            "works/old/available",
-            b'{"state": "runs"}',
-        ),  # values of a drive named "available", from a gateway with the prefix works/old
+        # values of a drive named "available", from a gateway with the prefix works/old
+        ("works/old/available", b'{"state": "runs"}'),
         ("works/old/available", b""),
         ("works/old", b"online"),
         ("available", b"online"),
         ("", b"offline"),
         ("homeassistant/device/works-old/config", b"online"),
         ("homeassistant/device/works-old/config", configuration("other/old")),
-        (
-            "homeassistant/device/works-hall-fan/config",
-            configuration("works-hall/fan"),
-        ),  # from a gateway with the prefix works-hall
+        # from a gateway with the prefix works-hall
+        ("homeassistant/device/works-hall-fan/config", configuration("works-hall/fan")),
         ("homeassistant/device/works-old/config", configuration("works/new")),
         ("homeassistant/device/works-old/config", configuration(["works/old"])),
         ("homeassistant/device/works-old/config", b"[" * 100_000),

@@ -46,9 +46,8 @@ class FakeGateway:
         self.confirms = False  # True: send the HTTP head of an answer before the rest is ready
         self.token: str | None = None  # token that POST requests must have; None: any caller may send them
         self.has_history = True
-        self.recorded: dict[
-            str, dict[str, object]
-        ] = {}  # by series: keys to add to the answer about its history
+        # by series: keys to add to the answer about its history
+        self.recorded: dict[str, dict[str, object]] = {}
         self.triggers: list[dict[str, Any]] = []  # the last triggers, newest first
         self.knows_since = 0  # UTC in ms since which all alarms are known
         self.maximum_hz = 50.0  # maximum frequency of all drives
