@@ -23,7 +23,7 @@ from multidrop.fleet.leases.lease import HeldRecord, Lease, boottime_ns
 from multidrop.fleet.leases.member import IncompatibleGateways, Member, MemberState
 from multidrop.fleet.leases.observer import Observer
 from multidrop.fleet.leases.rules import RULES, SECOND, USUAL, Terms
-from multidrop.fleet.lines import line_keeper, shares
+from multidrop.fleet.lines import line_keeper, releases, shares
 from multidrop.fleet.lines.line_keeper import PortLoss
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import Bucket, LeaseBucket
@@ -253,7 +253,7 @@ def test_while_a_server_is_silent_only_a_draining_gateway_releases_lines(
     async def main() -> None:
         async with gateways(fleet, "a", "b", terms=LONG) as running:
             await until(running.are_shared, "start")
-            monkeypatch.setattr(member_module, "known_cluster", maimed)
+            monkeypatch.setattr(releases, "known_cluster", maimed)
             joined, drained = await running.join("c"), running.members["b"]
             await until(lambda: "c" in drained.wanted.values(), "its share")
             await asyncio.sleep(1.0)

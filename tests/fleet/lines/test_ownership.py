@@ -11,9 +11,9 @@ from fleet_scale import groups, large_fleet, plant_of_fake_lines, until
 from nats_clusters import Cluster as Servers
 from tables import table
 
-from multidrop.fleet.leases import member
-from multidrop.fleet.leases.member import SILENT_SERVER_S, Releases
+from multidrop.fleet.lines import releases
 from multidrop.fleet.lines.ownership import NEEDED, Claim, Step, claim_of, decide, owner_by, owner_value
+from multidrop.fleet.lines.releases import SILENT_SERVER_S, Releases
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import Record
 from multidrop.fleet.servers.leaders import Cluster, Replica
@@ -208,7 +208,7 @@ class Releasing:
         self.now_s = 0.0
         nowhere: Any = None
         self.releases = Releases(lambda: nowhere, self.note, lambda: self.now_s)
-        monkeypatch.setattr(member, "known_cluster", self.known_cluster)
+        monkeypatch.setattr(releases, "known_cluster", self.known_cluster)
 
     def note(self) -> None:
         self.changes += 1
