@@ -66,7 +66,7 @@ CLIENTS = {  # packages that import only public names, and the commands that may
     "fleet": {
         *(
             f"cli/fleet/{name}.py"
-            for name in ("commands", "connection", "demo", "services", "setup", "views")
+            for name in ("commands", "connection", "demo", "gateway", "hub", "setup", "views")
         ),
     },
 }
