@@ -27,7 +27,7 @@ from multidrop.fleet.errors import FleetError, NoRight
 from multidrop.fleet.leases.lease import LifeLock
 from multidrop.fleet.leases.member import Member
 from multidrop.fleet.leases.rules import SECOND, USUAL
-from multidrop.fleet.lines.line_keeper import SILENT_S, PortLoss
+from multidrop.fleet.lines.line_keeper import LINES_AT_ONCE, SILENT_S, PortLoss
 from multidrop.fleet.lines.records import MOST_REPORTED
 from multidrop.fleet.samples.forwarder import Forwarder
 from multidrop.fleet.samples.samples_stream import samples_path
@@ -40,7 +40,6 @@ from multidrop.samples import PolledUnits, Spool
 from multidrop.supervisor import Ended, end_tasks, supervisor
 
 SPOOL_BYTES = 10_000_000_000
-LINES_AT_ONCE = 32  # limit of lines that are opened or closed concurrently
 STATE = {"state": str, "lines": int, "margin_s": float, "trouble": str, "troubles": dict, "spool": dict}
 SPOOL = {"bytes": int, "lost": int, "behind": int | None, "lag_s": float | None, "trouble": str | None}
 # time limit at shutdown for forwarding samples; remaining samples are forwarded after the next start

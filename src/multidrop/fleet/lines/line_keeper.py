@@ -43,7 +43,7 @@ SILENT_S = 0.5
 TAKE_AGAIN_S = 2.0  # pause between attempts to open a line
 # limit of ownership records written together: larger batches would delay renewals of the lease
 WRITTEN_AT_ONCE = 64
-LINES_AT_ONCE = 32
+LINES_AT_ONCE = 32  # limit of lines that are opened or closed concurrently
 WRITERS = 2  # limit of concurrent batches of writes in each bucket
 # Two renewal periods. If the last renewal of a lease record is this much older than those of the other two,
 # the servers of its bucket may have no leader.

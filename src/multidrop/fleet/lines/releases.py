@@ -11,7 +11,7 @@ from multidrop.fleet.servers import names
 from multidrop.fleet.servers.connections import ServerPath
 from multidrop.fleet.servers.leaders import known_cluster
 
-SERVERS_LOOK_S = 0.05  # pause between checks of the servers' states
+LOOK_S = 0.05  # pause between checks of the servers' states
 SILENT_SERVER_S = 60.0  # a server that is silent for longer than this (in s) is ignored
 
 
@@ -56,7 +56,7 @@ class Releases:
     async def watch(self) -> None:
         while True:
             await self.look()
-            await asyncio.sleep(SERVERS_LOOK_S)
+            await asyncio.sleep(LOOK_S)
 
     async def look(self) -> None:
         """Check the servers' states once if a line waits for its release."""
