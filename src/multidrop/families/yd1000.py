@@ -50,8 +50,7 @@ class YD1000Control(IntFlag):
 
 STOP = YD1000Control.COMMAND_VALID | YD1000Control.FREQUENCY_VALID  # only bits 15 and 14, without the run bit
 
-# the bits with the values 1, 2 and 4 in the number of the preset speed
-PRESET_SPEEDS = (
+PRESET_SPEEDS = (  # the bits with the values 1, 2 and 4 in the number of the preset speed
     YD1000Control.PRESET_SPEED_1,
     YD1000Control.PRESET_SPEED_2,
     YD1000Control.PRESET_SPEED_3,
