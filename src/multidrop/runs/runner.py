@@ -44,7 +44,7 @@ SHORTEST_S = 1e-4  # shortest period of a polled register, in s
 MOST_WAITING = 3000  # limit of batches (30 s or more) that wait for the recording or for a callback
 # On a busy computer, a simulated drive may reply later than a real drive's time-out.
 SIMULATED_ATTEMPTS = 20  # number of attempts of a command to a simulated drive
-SIMULATED_SILENCE_S = 60.0  # the default of `silence` if all lines are simulated
+SIMULATED_SILENCE_S = 60.0  # the least default of `silence` if all lines are simulated
 ENDING_S = 10.0  # how long the end of a run waits for the recording and for each taker, in s
 
 
