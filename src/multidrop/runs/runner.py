@@ -22,7 +22,7 @@ from multidrop.control.exit_hook import await_signal
 from multidrop.control.outcome import Seen, Stopped
 from multidrop.control.ramp import check_setpoint, checked_rate, ramp
 from multidrop.drive.family import Drive
-from multidrop.errors import BadReply, BusError, Expired, NoReply, Unconfirmed
+from multidrop.errors import BadReply, BusError, Expired, NoReply
 from multidrop.plant.model import Plant, Polled, PolledDrive
 from multidrop.poller import Poller
 from multidrop.polling.batch import Rows, copied
@@ -43,7 +43,7 @@ UNKNOWN = "the stops of its line failed; the log has the error"
 SHORTEST_S = 1e-4  # shortest period of a polled register, in s
 MOST_WAITING = 3000  # limit of batches (30 s or more) that wait for the recording or for a callback
 # On a busy computer, a simulated drive may reply later than a real drive's time-out.
-SIMULATED_ATTEMPTS = 20  # number of attempts of a command to a simulated drive
+SIMULATED_ATTEMPTS = 20  # most attempts to check or command a simulated drive
 SIMULATED_SILENCE_S = 60.0  # the least default of `silence` if all lines are simulated
 ENDING_S = 10.0  # how long the end of a run waits for the recording and for each taker, in s
 
@@ -392,20 +392,19 @@ class _Session:
             for rate in {step.rate for step in steps if step.rate}:
                 drive.perform(checked_rate(drive, rate))
 
-        self._insist(drive, check)
+        self._insist(drive, check, NoReply, BadReply, Expired)
 
     def _command(self, drive: Drive, step: RunStep) -> None:
-        self._insist(drive, lambda: _command(drive, step))
+        """Command the drive as the step says. No start that may have been sent is sent again."""
+        self._insist(drive, lambda: _command(drive, step), Expired)
 
-    def _insist(self, drive: Drive, work: Callable[[], object]) -> object:
-        """Do the work. If the drive is simulated and replied too late, repeat the work. Commands to a real
-        drive are not repeated.
-        """
+    def _insist(self, drive: Drive, work: Callable[[], object], *too_late: type[Exception]) -> object:
+        """Do the work. If the drive is simulated, repeat the work after one of the errors `too_late`."""
         attempts = SIMULATED_ATTEMPTS if _is_simulated(drive.bus) else 1
         for attempt in range(attempts):
             try:
                 return work()
-            except (NoReply, BadReply, Unconfirmed, Expired):
+            except too_late:
                 if attempt == attempts - 1 or self._is_stopping:
                     raise
         return None
