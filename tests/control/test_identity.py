@@ -18,7 +18,7 @@ from tables import table
 from multidrop import Bus, Drive, InnovertIBD, InvtCHE, NoReply, Poller, Unconfirmed, WriteForbidden
 from multidrop.control import records
 from multidrop.control.outcome import Seen
-from multidrop.core import PAUSE_NS, Completion, Exchange, Framing, Message, build_reply
+from multidrop.core import PAUSE_NS, Completion, Exchange, Failure, Framing, Message, Status, build_reply
 from multidrop.drive import Script, write
 from multidrop.drive.register import Kept, reading, setting
 from multidrop.drive.verbs import verb
@@ -30,6 +30,7 @@ from multidrop.transport import clock, peers
 
 every_family = pytest.mark.parametrize("model", usually(*MAKE))
 GOODRIVE = 0x010A  # device code of another INVT series; a CHE has 0101H
+GOODRIVE_DEVICE = 0x2103  # register of the device code in a Goodrive (Goodrive200A manual p. 140)
 
 
 @contextmanager
@@ -626,3 +627,72 @@ def test_a_stop_by_a_plain_write_is_withheld_if_another_family_answers_twice(
         with pytest.raises(WriteForbidden, match="no stop was sent"):
             drive.write(drive.control, CHEControl.STOP)
     assert len(line.written) == 2 - suspicions
+
+
+# ---- drives that cannot identify themselves ----
+
+
+def count_silences(line: SimulatedBus) -> None:
+    """Count missing replies, as the core does."""
+    carry_out = line.carry_out
+
+    def counted(exchange: Exchange, **times: Any) -> Completion:
+        completion = carry_out(exchange, **times)
+        if completion.result == Failure.NO_REPLY:
+            exchange.c.drive.history.ended[Status.NO_REPLY] += 1
+        return completion
+
+    line.carry_out = counted  # type: ignore[method-assign]
+
+
+def answers_as(line: SimulatedBus, counts: dict[int, int]) -> None:
+    """Answer reads with these raw counts by address, and refuse all other reads."""
+
+    def answer(request: Message) -> bytes | None:
+        if is_write(request):
+            return None
+        if request.start not in counts:
+            return build_reply(Framing.RTU, Message(1, request.function, exception=2))
+        return build_reply(
+            Framing.RTU, Message(1, request.function, data=counts[request.start].to_bytes(2, "big"))
+        )
+
+    line.answers = answer
+
+
+def test_a_drive_that_lacks_another_makes_registers_is_checked_for_them_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """An IBD does not answer reads of registers that it lacks. Each of them delays the drive's polling."""
+    line, drive, _ = one(monkeypatch, InnovertIBD(1, confirmed=1))
+    count_silences(line)
+    drive.set_frequency(20)
+    foreign = [request for request, _ in line.frames if request.start == GOODRIVE_DEVICE]
+    assert len(foreign) == 2  # twice, because the first reply may be lost by chance
+    line.frames.clear()
+    drive.start()
+    drive.set_frequency(30)
+    assert GOODRIVE_DEVICE not in {request.start for request, _ in line.frames}
+
+
+def test_another_make_is_recognised_although_its_first_reply_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, _ = one(monkeypatch, InnovertIBD(1, confirmed=1))
+    count_silences(line)
+    answers_as(line, {GOODRIVE_DEVICE: GOODRIVE, 0x2100: 3, 0x0000: 0})
+    line.loses = lambda request: len(line.frames) == 1
+    with pytest.raises(WriteForbidden, match="it answers as an INVT Goodrive does"):
+        drive.set_frequency(20)
+    assert line.written == []
+
+
+def test_every_other_make_is_excluded_after_an_earlier_silence(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, _ = one(monkeypatch, InnovertIBD(1, confirmed=1))
+    count_silences(line)
+    line.loses = lambda request: True
+    with pytest.raises(NoReply):
+        drive.read("terminals")
+    line.loses = lambda request: False
+    answers_as(line, {0x3000: 3, 0x8000: 0, 0x1000: 0})
+    with pytest.raises(WriteForbidden, match="it answers as a Powtran PI130"):
+        drive.set_frequency(20)
+    assert line.written == []

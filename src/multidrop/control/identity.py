@@ -6,7 +6,7 @@ from the adapter's echo: most such replies are, like an echo, copies of their re
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext, suppress
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
@@ -171,14 +171,33 @@ class IdentityCheck:
                 rule="it does not answer like its family",
             ) from refusal
         if drive.identity_is_weak and (rivals := easily_mistaken_for(drive)):
-            make = self._shown(drive, rivals, timed)
-            if make is not None:
-                why = f"nothing is written to {drive.name}: {_declare(make)}"
-                raise WriteForbidden(why, rule="it shows another make")
+            silences = self._exclude(drive, rivals, timed, silences)
         if not self._exchanges.has_answered(drive):
             with timed():
                 self._echo.read_any(drive, READ_ATTEMPTS)
         self._know(drive, findings, silences, was_heard=was_heard)
+
+    def _exclude(self, drive: Drive, makes: Sequence[Make], timed: Timed, silences: int) -> int:
+        """Raise WriteForbidden if the drive's registers show one of these makes.
+
+        A drive may leave a read of a register that it lacks unanswered. So might a drive of one of these
+        makes, by chance, if a reply is lost. Therefore the check is repeated after a missing reply. Returns
+        `silences`, plus the number of replies that are missing only because the drive lacks these registers.
+        """
+        peer = self._exchanges.peers.of(drive)
+        for _ in range(SURE):
+            before = peer.silences
+            make = self._shown(drive, makes, timed)
+            if make is not None:
+                why = f"nothing is written to {drive.name}: {_declare(make)}"
+                raise WriteForbidden(why, rule="it shows another make")
+            missing = peer.silences - before
+            if not missing:
+                break
+            silences += missing
+            with timed():
+                self._echo.read_any(drive, READ_ATTEMPTS)
+        return silences
 
     def _know(self, drive: Drive, findings: _Findings, silences: int, *, was_heard: bool) -> None:
         """Record that the family was confirmed; `was_heard` is False if the drive had been silent before."""
@@ -221,7 +240,9 @@ class IdentityCheck:
             findings.suspicion = suspicion
             raise CheckAgain
         if suspicion is not None and suspicion == before:
-            other = self._lookalike(drive, register, count) or self._shown(drive, rivals)
+            other = self._lookalike(drive, register, count) or self._shown(
+                drive, self._while_in_step(drive, rivals)
+            )
             if other is not None or suspicion.is_certain:
                 # the result is not kept: the next stop checks the drive again
                 raise _withheld(drive, suspicion.why, other)
@@ -277,7 +298,8 @@ class IdentityCheck:
 
     def _rival(self, drive: Drive, rivals: Sequence[Make]) -> Suspicion | None:
         """Return a suspicion if the family's identity is weak and the drive answers as one of these makes."""
-        make = self._shown(drive, rivals) if drive.identity_is_weak else None
+        makes = self._while_in_step(drive, rivals)
+        make = self._shown(drive, makes) if drive.identity_is_weak else None
         return None if make is None else Suspicion(_declare(make), make=make)
 
     def _shown(self, drive: Drive, makes: Iterable[Make], timed: Timed = nullcontext) -> Make | None:
@@ -303,9 +325,14 @@ class IdentityCheck:
                     return make
             except NoReply:
                 is_silent = True
-            if not self._is_in_step(drive):
-                return None
         return None
+
+    def _while_in_step(self, drive: Drive, makes: Iterable[Make]) -> Iterator[Make]:
+        """Yield these makes until a late reply could be taken for a reply that shows the next one."""
+        for make in makes:
+            yield make
+            if not self._is_in_step(drive):
+                return
 
     def _lookalike(self, drive: Drive, register: Register[Any], count: float) -> Drive | None:
         """Return the drive as an object of a built-in family that recognises it SURE times; None without one.
@@ -369,7 +396,11 @@ def _stops(family: type[Drive], register: Register[Any], count: float) -> bool:
 
 
 def _declare(make: Make) -> str:
-    return f"it answers as an {make.title} does; if it is one, declare model {make.model}"
+    return f"it answers as {_with_article(make.title)} does; if it is one, declare model {make.model}"
+
+
+def _with_article(title: str) -> str:
+    return f"{'an' if title[0] in 'AEIO' else 'a'} {title}"
 
 
 def _forget_setpoint(drive: Drive) -> None:
@@ -388,7 +419,7 @@ def _withheld(drive: Drive, why: str, other: Drive | Make | None) -> WriteForbid
     if other is not None:
         attach = f"{type(other).__name__}({drive.address})" if isinstance(other, Drive) else other.model
         way = (
-            f"It answers as a {other.title} does. Use the hard-wired stop, or stop it as that: "
+            f"It answers as {_with_article(other.title)} does. Use the hard-wired stop, or stop it as that: "
             f"`multidrop stop PORT {other.model} {drive.address}`; in a program detach {drive.name} "
             f"first, and attach {attach}"
         )
