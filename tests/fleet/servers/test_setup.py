@@ -404,6 +404,17 @@ def test_a_line_record_cannot_write_a_file_outside_the_lines_folder(tmp_path: Pa
     assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == []
 
 
+@pytest.mark.parametrize("model", ["own.py:Own", "own.py"])
+def test_a_gateway_does_not_run_a_python_file_from_a_line_record(tmp_path: Path, model: str) -> None:
+    ran = tmp_path / "ran"
+    drive = {"name": "pump", "model": model, "address": 1}
+    line = {"name": "hall", "port": "tcp://127.0.0.1:502", "drive": [drive]}
+    files = {"own.py": f"open({str(ran)!r}, 'w')\n"}
+    with pytest.raises(ValueError, match="gateways run no code from the network"):
+        line_of(Record("hall", 1, {"line": line, "files": files}), tmp_path / "gateway")
+    assert not ran.exists()
+
+
 async def test_storing_a_plant_again_keeps_the_revision_of_unchanged_lines() -> None:
     memory = MemoryBucket("plant")
     bucket: Any = memory

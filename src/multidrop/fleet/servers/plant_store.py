@@ -70,12 +70,7 @@ def _description(
     table: Mapping[str, Any], folder: Path, may: Mapping[str, Collection[str]]
 ) -> dict[str, Any]:
     files: dict[str, str] = {}
-    for model in {drive["model"] for drive in table["drive"]}:
-        if ".py" in model:
-            raise ValueError(
-                f"line {table['name']}: the family {model} is a Python file, and gateways run no code "
-                "from the network; declare it in TOML"
-            )
+    for model in _models(table):
         if model.endswith(".toml"):
             files |= _family_files(folder, model)
     drives = {drive["name"] for drive in table["drive"]}
@@ -85,6 +80,20 @@ def _description(
     }
     lists = {key: entries for key, entries in own.items() if entries}
     return {"line": dict(table), "files": files} | ({"may": lists} if lists else {})
+
+
+def _models(line: Mapping[str, Any]) -> set[str]:
+    """Return the families that a line names. Raises ValueError if one is a Python file."""
+    drives = line.get("drive")
+    tables = [drive for drive in drives if isinstance(drive, dict)] if isinstance(drives, list) else []
+    models = {str(table.get("model")) for table in tables}
+    for model in models:
+        if ".py" in model:
+            raise ValueError(
+                f"line {line.get('name')}: the family {model} is a Python file, and gateways run no code "
+                "from the network; declare it in TOML"
+            )
+    return models
 
 
 def _family_files(folder: Path, model: str) -> dict[str, str]:
@@ -132,9 +141,11 @@ async def store(bucket: Bucket, records: Mapping[str, Any]) -> dict[str, int]:
 def line_of(record: Record, folder: Path) -> PlantLine:
     """Return the line that a record describes. Its files are written into the line's own folder in `folder`.
 
-    Raises ValueError for an invalid record.
+    Raises ValueError for an invalid record. Other programs than `fleet init` may have written it, so a Python
+    file is refused here too.
     """
     value, home = record.value, folder / record.key
+    _models(value["line"])
     home.mkdir(parents=True, exist_ok=True)
     for name, text in value["files"].items():
         path = Path(name)
