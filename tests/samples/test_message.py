@@ -169,12 +169,12 @@ def written(options: pa.ipc.IpcWriteOptions | None = None, **other: pa.Array) ->
         ("drive", NAMELESS, "the column drive has a null text"),
         ("status", NAMELESS, "the column status has a null text"),
         ("unit", NAMELESS, "the column unit has a null text"),
-        ("drive", named("fan\0", "fan"), "a drive has a NUL character"),
-        ("register", named("speed", "\0"), "a register has a NUL character"),
-        ("status", named("ok", "o\0k"), "a status has a NUL character"),
-        ("unit", named("Hz", "\0"), "a unit has a NUL character"),
-        ("drive", named("f" * 1001, "fan"), "a drive is longer than 1000 bytes"),
-        ("register", named("speed", "ü" * 501), "a register is longer than 1000 bytes"),
+        ("drive", named("fan\0", "fan"), "a text in the column drive has a NUL character"),
+        ("register", named("speed", "\0"), "a text in the column register has a NUL character"),
+        ("status", named("ok", "o\0k"), "a text in the column status has a NUL character"),
+        ("unit", named("Hz", "\0"), "a text in the column unit has a NUL character"),
+        ("drive", named("f" * 1001, "fan"), "a text in the column drive is longer than 1000 bytes"),
+        ("register", named("speed", "ü" * 501), "a text in the column register is longer than 1000 bytes"),
         ("uncertainty_us", pa.array([1, 1 << 31], pa.int64()), "Integer value 2147483648 not in range"),
     ],
 )
@@ -262,7 +262,7 @@ def test_columns_that_a_conversion_would_make_much_larger_are_rejected(
     columns = alike(rows)
     data = written(ZSTD, **(columns | {column: OF_ONE_TEXT[column](rows)}))
     before = most_allocated()
-    with pytest.raises(MessageError, match=f"the column {column} has another type"):
+    with pytest.raises(MessageError, match=f"the column {column} has the wrong type"):
         unpack(data)
     assert most_allocated() - before < 8 << 20
 
@@ -273,7 +273,7 @@ def test_the_limit_of_rows_applies_to_columns_that_need_no_bytes(most_allocated:
     sink = pa.BufferOutputStream()
     with pa.ipc.new_stream(sink, schema) as writer:
         writer.write_batch(rows)
-    with pytest.raises(MessageError, match="the column time has another type"):
+    with pytest.raises(MessageError, match="the column time has the wrong type"):
         unpack(sink.getvalue())
     assert most_allocated() < 1 << 20
 

@@ -71,7 +71,7 @@ class FollowedRows:
 class NameCodes:
     """Numbers names in the order of their first use.
 
-    If there are `most` names already, each new name gets the number of the name `rest`.
+    After `most` names, each new name gets the number of the name `rest`.
     """
 
     def __init__(self, most: int, rest: str, *names: str) -> None:
@@ -99,8 +99,7 @@ class RowReader:
         self._statuses = NameCodes(MOST_STATUSES, OTHER, "ok")
         self._newest: dict[tuple[str, str], int] = {}  # time of the newest sample, by drive and register
         self._read_ns = 0  # this computer's clock (UTC, ns) at the last call of `rows`
-        # By gateway: when its newest sample arrived, by this computer's clock, and the sample's own time
-        # (UTC, ns).
+        # by gateway: arrival time of its newest sample, and the sample's own time (UTC, ns)
         self.arrivals: dict[str, tuple[int, int]] = {}
 
     def rows(self, messages: Sequence[StreamMessage]) -> FollowedRows | None:
@@ -145,7 +144,7 @@ class RowReader:
 
 def _newest_rows(message: StreamMessage) -> list[tuple[tuple[str, str], tuple[Any, ...]]]:
     """Return the newest sample (time, uncertainty, value, status) of each pair of drive and register."""
-    if message.sequence == 0:  # no gateway has sent this message
+    if message.sequence == 0:  # the message is not from a gateway
         return []
     try:
         table = unpack(message.data)

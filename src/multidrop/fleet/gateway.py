@@ -1,7 +1,4 @@
-"""FleetGateway: a gateway process of a fleet.
-
-It polls the lines assigned to it and forwards their samples.
-"""
+"""FleetGateway: a process that polls the lines assigned to it and forwards their samples."""
 
 from __future__ import annotations
 
@@ -278,7 +275,7 @@ class FleetLines:
     def _take(self, record: Record) -> None:
         line = line_of(record, self._folder)
         polled = {drive.name for bus in self.poller.buses.values() for drive in bus.drives}
-        # a line without polled drives would be refused by `add_line`
+        # `add_line` will refuse a line that has a drive of a polled line
         if not any(one.drive.name in polled for one in line.drives):
             # units must be known before the line's first sample arrives
             self._units.note(line, time.monotonic_ns())

@@ -132,7 +132,7 @@ def _answer(head: bytes, metrics: Metrics) -> bytes:
 
 
 def answer(head: bytes, metrics: Metrics) -> bytes:
-    """Return the whole HTTP response to a request, whatever bytes the request has."""
+    """Return the HTTP response to a request, which may be any bytes."""
     lines = head.decode("latin-1").split("\r\n")
     fields = [line.partition(":") for line in lines[1:] if line]
     headers = {name.strip().lower(): value.strip() for name, _, value in fields}

@@ -1,3 +1,1 @@
-"""The gateway: one process that polls the lines and serves the values to browsers, brokers and Modbus
-clients.
-"""
+"""The gateway: one process that polls the lines and serves the values to browsers and other programs."""

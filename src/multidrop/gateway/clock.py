@@ -1,6 +1,4 @@
-"""Clocks: the monotonic clock, which dates polled values; the boot-time clock, which also runs while the
-computer sleeps; and UTC.
-"""
+"""Clocks: monotonic time, boot time (which also runs while the computer sleeps), and UTC."""
 
 from __future__ import annotations
 
@@ -16,7 +14,6 @@ if hasattr(time, "CLOCK_MONOTONIC"):
 else:
 
     def monotonic_ns() -> int:
-        """Return the monotonic time in ns, the clock by which polled values are dated."""
         return time.monotonic_ns()
 
 
@@ -31,11 +28,8 @@ else:  # on macOS and Windows the monotonic clock itself runs while the computer
 
 
 def now_and_slept_ns() -> tuple[int, int]:
-    """Return the monotonic time and the total time that the computer has slept since its boot, both in ns.
-
-    Reads the boot-time clock first, so that a pause between the two reads never counts as sleep.
-    """
-    booted_ns = boottime_ns()
+    """Return the monotonic time, and how long the computer has slept since its boot, both in ns."""
+    booted_ns = boottime_ns()  # read first, so that a pause between the two reads never counts as sleep
     now_ns = monotonic_ns()
     return now_ns, booted_ns - now_ns
 

@@ -1,5 +1,4 @@
-"""Commands: check and carry out register writes and verbs, such as start and stop, that arrive over the
-gateway's interfaces.
+"""Commands: check and carry out the writes and verbs, such as start, that the gateway receives.
 
 A command is allowed only if the caller's role, the plant file's lists and the library's own rules allow it. A
 stop needs only the role, and does not wait for other commands.
@@ -35,8 +34,7 @@ from multidrop.plant import drive_meant
 from multidrop.supervisor import supervisor
 
 MOST_AGE_S = 5.0  # age limit, in s, of writes and verbs when they arrive; stops have none
-# interval, in s, of checking during a reload whether drives that must be stopped again are attached
-LOOK_S = 0.02
+LOOK_S = 0.02  # pause between two checks for drives that a reload has changed during their stop
 MOST_WRITES = 8  # limit of concurrent writes on one line; stops are not counted
 MOST_STOPS = 8  # limit of concurrent stops of one drive that arrive over one interface
 # Values of the field `rule` of WriteForbidden.
@@ -181,10 +179,7 @@ class Commands:
     async def _stop_by(
         self, verb: str, lines: Sequence[LineStop], wanted: Iterable[str], caller: Caller
     ) -> dict[str, CommandResult]:
-        """Stop those of the wanted drives that are on these lines, with the verb `verb`.
-
-        Return a result for each wanted name, also for unknown drives.
-        """
+        """Stop the drives on these lines with this verb; return a result for each name in `wanted`."""
         names = [drive.name for line in lines for drive in line.drives]
         self._note_stop(names)
         with _written_by(caller):
@@ -265,13 +260,13 @@ class Commands:
         return result
 
     def note_refused(self, line: str, drive: str, what: str, why: str, caller: Caller) -> None:
-        """Record in the audit log a write that the Modbus server or a tool port refused."""
+        """Record a refused write in the audit log."""
         _log.warning("%s: %s, asked for by %s: %s", drive, what, caller.by, why)
         with _written_by(caller), suppress(ValueError):  # raised if a reload has removed the line
             self._lines.bus(line).note_refused(drive, what, why)
 
     def _unsupported(self, verb: str) -> CommandResult | None:
-        """Return the refusal of a verb, or of "write", that this gateway never carries out."""
+        """Return the refusal of a command that this gateway never carries out; None for other commands."""
         return None
 
     def _moves(self, drive: str, register: str) -> bool:

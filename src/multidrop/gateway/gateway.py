@@ -161,8 +161,7 @@ class Gateway:
             await self._close(server)
 
     def _source(self) -> Any:
-        """Return the object that supplies a fleet's lines and values if the plant file has no lines, else
-        None.
+        """Return the source of a fleet's lines and values; None if the plant file has lines itself.
 
         Raises OSError if the gateway's part `fleet`, which supplies them, is not built yet.
         """
@@ -265,9 +264,7 @@ class Gateway:
             await asyncio.sleep(TAKE_S)
 
     def hand_out(self, poller: Poller) -> None:
-        """Give each batch of polled values to the hub and to all parts of the gateway; if one fails,
-        continue.
-        """
+        """Give all new polled values to the hub and to each part; the failure of one stops no other."""
         while batch := poller.take():
             self._has_news = True
             batch = self.reload.without_changed_drives(batch)

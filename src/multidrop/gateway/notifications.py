@@ -1,10 +1,8 @@
-"""The gateway's part `notify`: sends a message for each alarm that starts or ends, to webhooks and to
-Apprise's services.
+"""The gateway's part `notify`: sends a message for each alarm that starts or ends.
 
-Each target has its own thread, so that a target that hangs delays nothing else.
-
-Addresses of targets contain secrets. Logs and errors show only the scheme of an address, and the host of a
-webhook.
+A target of messages is a webhook or a service of the library Apprise. Each has its own thread, so that a
+target that hangs delays no other. Addresses of targets contain secrets. Logs and errors show only the scheme
+of an address, and the host of a webhook.
 """
 
 from __future__ import annotations

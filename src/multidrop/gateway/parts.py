@@ -22,9 +22,7 @@ from multidrop.gateway.live.alarms import Alarms
 from multidrop.gateway.live.hub import Hub
 from multidrop.supervisor import supervisor
 
-# in s: how long a start or a reload waits for parts that are still being built because their disks do not
-# answer
-BUILD_S = 3.0
+BUILD_S = 3.0  # in s: how long a start or a reload waits for parts that are being built
 END_S = 3.0  # time limit, in s, for closing one part, such as MQTT
 
 # By part: the Python module, which is imported if the plant file has the part's table. The module has
@@ -138,9 +136,7 @@ class LiveParts:
         self._replaced: dict[str, Any] = {}
 
     def source(self) -> Any:
-        """Return the attribute `source` of a part that is built but not started; None if no such part
-        has one.
-        """
+        """Return the attribute `source` of a part that is built but not started; None if none has it."""
         built = [one.part.result() for one in self._built.values() if one.part.done()]
         sources = (getattr(part, "source", None) for part in built)
         return next((source for source in sources if source is not None), None)
@@ -175,8 +171,7 @@ class LiveParts:
     # ---- reload ----
 
     async def replace(self, wanted: Mapping[str, Any], plant: Plant) -> None:
-        """Close the parts whose tables were changed or removed, and build the parts of new and changed
-        tables.
+        """Close the parts with changed or removed tables, and build those with changed or new tables.
 
         If a new part cannot be opened, the previous parts are started again, and ValueError is raised.
         """

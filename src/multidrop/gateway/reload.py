@@ -37,9 +37,7 @@ _log = logging.getLogger("multidrop.gateway")
 
 
 class ReloadResult(NamedTuple):
-    """The result of a reload: the mistakes in the plant file, or sentences about changes that need a
-    restart.
-    """
+    """The result of a reload: mistakes in the plant file, or changes that need a restart."""
 
     is_done: bool
     text: str

@@ -62,9 +62,7 @@ class _NoRedirects(urllib.request.HTTPRedirectHandler):
 
 
 class _Answer(HTTPResponse):
-    """An answer that must arrive completely within SEND_S. A server that sends single bytes could take
-    days.
-    """
+    """An answer that must arrive within SEND_S. A server that sends single bytes could take days."""
 
     def __init__(self, sock: socket.socket, *arguments: Any, **more: Any) -> None:
         super().__init__(sock, *arguments, **more)

@@ -134,9 +134,7 @@ class Folders:
 
 
 def input_file(name: str, plant: Plant) -> Path:
-    """Return the path of a plant's input file, with the folders in this process's environment; see
-    `Folders`.
-    """
+    """Return the path of a plant's input file, with the folders in this process's environment."""
     return Folders(plant.path, os.environ).find(name)
 
 

@@ -27,7 +27,7 @@ from multidrop.report.style import (
     set_title,
 )
 
-MOST_REASONS = 6  # limit of reasons for misses in a picture; further reasons are drawn together
+MOST_REASONS = 6  # limit of reasons for misses in a picture; further ones are drawn as "other reasons"
 # A bin with fewer requested values is left out, because its share of misses is not significant.
 LEAST_IN_BIN = 20
 BINS = 12  # number of bins into which output frequencies are sorted
@@ -52,8 +52,7 @@ class DelaySeries:
 def delays(recording: Recording) -> list[DelaySeries]:
     """Return the delays of every drive that answered.
 
-    The first reply after a lost request is left out, because it may be a late reply to that request. Then its
-    delay is unknown.
+    The first reply after a lost request is left out, because it may be a late reply to that request.
     """
     found = []
     for drive in recording.drives:
@@ -70,7 +69,7 @@ def delays(recording: Recording) -> list[DelaySeries]:
 
 
 def _spans_loss(series: Series) -> Array:
-    """Return an array: True for each value whose request overlaps a miss, so that it may be a late reply."""
+    """Mark each value whose request overlaps a miss: its reply may be a late one to another request."""
     asked = [number for number, status in enumerate(series.statuses) if not status.startswith(UNASKED)]
     lost = np.unique(series.time[series.missed & np.isin(series.status, asked)])
     next_lost = np.append(lost, np.iinfo(np.int64).max)[np.searchsorted(lost, series.time)]
@@ -94,9 +93,7 @@ def _request_seconds(recording: Recording, drive: str) -> float | None:
 
 
 def draw_delays(found: Sequence[DelaySeries]) -> Figure:
-    """Draw a box plot of the first MOST_DRIVES drives, with quartiles, and whiskers at the 1 % and 99 %
-    quantiles.
-    """
+    """Draw the delays as a box plot with whiskers at the 1 % and 99 % quantiles."""
     found = found[:MOST_DRIVES]
     figure, (axes,) = new_figure([0.8 + 0.32 * len(found)])
     axes.boxplot(
@@ -122,9 +119,7 @@ def draw_delays(found: Sequence[DelaySeries]) -> Figure:
 
 
 def draw_rates(recording: Recording) -> Figure:
-    """Draw two plots: the values per second of the first MOST_DRIVES drives, and the misses per second of all
-    drives, by reason.
-    """
+    """Draw the values per second by drive, and below them the misses per second by reason."""
     figure, (rates, misses) = new_figure([2.2, 1.8], sharex=True)
     bins = TimeBins(recording.begin, recording.end)
     for number, drive in enumerate(recording.drives[:MOST_DRIVES]):
@@ -230,8 +225,9 @@ class LineUse:
 
     @property
     def cycle(self) -> float | None:
-        """The time in s in which each register is read once. None if a register has its own rate, or if there
-        are no values.
+        """The time in s to read each register once.
+
+        None if there are no values, or if a register has its own rate.
         """
         blocks = [block for drive in self.planned["drives"].values() for block in drive["blocks"]]
         if any(block["every_ms"] is not None for block in blocks) or not self.values:
@@ -252,9 +248,7 @@ def line_uses(recording: Recording) -> list[LineUse]:
 
 
 def _checked(planned: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the plan with its figures as floats.
-
-    Raises ValueError, KeyError, TypeError or AttributeError for a damaged plan; `line_uses` catches these."""
+    """Return the plan with its figures as floats. A damaged plan raises an error that `line_uses` catches."""
     drives = {
         name: {**drive, **{key: _figure(drive[key]) for key in _DRIVE_FIGURES}}
         for name, drive in planned["drives"].items()
@@ -288,7 +282,7 @@ def _line_use(recording: Recording, line: str, planned: Mapping[str, Any]) -> Li
     time, needed, silence = (np.concatenate(column) for column in zip(*parts, strict=True))
     order = np.argsort(time, kind="stable")
     time, needed, silence = time[order], needed[order], silence[order]
-    if len(time):  # the silence between two exchanges is the longer one of the two that they need
+    if len(time):  # of two successive exchanges, the one that needs the longer silence determines it
         needed = needed + np.maximum(silence, np.concatenate([silence[1:], silence[-1:]]))
         # Some ports, such as network ports, are faster than their baud rate: limit the needed time to the
         # measured time.
@@ -300,8 +294,8 @@ def _line_use(recording: Recording, line: str, planned: Mapping[str, Any]) -> Li
 def _exchanges(recording: Recording, name: str, drive: Mapping[str, Any]) -> tuple[Array, Array, int]:
     """Return the answered exchanges of a drive, and the number of values in their replies.
 
-    The first array has the time of each exchange in ns UTC, the second its duration in s, up to the reply's
-    end. Values with the same time were read by one exchange. Its registers may differ from the planned ones.
+    The first array has the time of each exchange in ns UTC, the second its duration in s up to the reply's
+    end. Values with the same time were read by one exchange.
     """
     registers = [register for block in drive["blocks"] for register in block["registers"]]
     read = [(series, ~series.missed) for register in registers for series in recording.of(name, register)]

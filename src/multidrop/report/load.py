@@ -30,8 +30,7 @@ from multidrop.recording.series import (
 )
 
 LARGEST = 1e150  # larger values are not drawn, because matplotlib multiplies values
-# The time between two rows is a pause if it is longer than PAUSE_NS, and longer than PAUSE_STEPS times its
-# neighbours.
+# rows are a pause apart if their interval exceeds PAUSE_NS, and PAUSE_STEPS times both neighbouring intervals
 PAUSE_NS, PAUSE_STEPS = 2 * 10**9, 5
 MOST_ROWS = 100_000_000  # limit of a recording's rows, which then take 5 GB of memory
 MOST_NAMES = 4096  # limit of the number of different names: of drives, of registers, and of statuses
@@ -74,9 +73,7 @@ class Series:
 
     @cached_property
     def pauses(self) -> Array:
-        """An array with True for each row after which polling paused, so that neither values nor misses
-        follow. It has no entry for the last row.
-        """
+        """For each row but the last: True if polling paused after it."""
         steps = np.diff(self.time)
         beside = np.maximum(np.append(steps[1:], 0), np.append(0, steps[:-1]))
         return np.asarray((steps > PAUSE_NS) & (steps / PAUSE_STEPS > beside) & (beside > 0))
@@ -119,7 +116,7 @@ class Series:
         ]
 
     def name_of(self, value: float) -> str:
-        """Return a raw value's name, the names of its set bits, or else a text with the number."""
+        """Return the name of a raw value, or the names of its set bits; "code 7" if it has no name."""
         if not value.is_integer() or not 0 <= value < LARGEST_COUNT:
             return f"code {value:g}"
         number = int(value)
@@ -228,7 +225,6 @@ def load(path: str | Path) -> Recording:
     metadata = {**reader.metadata, "drives": checked_drives(reader.metadata.get("drives"))}
     drives, registers, statuses = map(tuple, codes.values())
     series = []
-    # in the order in which the series first appear
     for rows_of in sorted(rows_by_series(drive, register, time), key=np.min):
         drive_name, register_name = drives[drive[rows_of[0]]], registers[register[rows_of[0]]]
         about = metadata["drives"].get(drive_name, {}).get("registers", {}).get(register_name, {})

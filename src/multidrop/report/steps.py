@@ -15,7 +15,7 @@ KILOWATTS = {"kW": 1.0, "W": 1e-3}  # units of power, as multiples of 1 kW; thei
 
 
 class StepValues(NamedTuple):
-    """The values of one register in one step of a test run. Times are in s, `slope` is in the unit per s.
+    """Figures of one register in one step of a test run. Times are in s; `slope` is in the unit per s.
 
     `settling` is the time from the start of the step until the value stays near its settled value. That is
     the mean of the step's last fifth. "Near" means within 2 % of the value's change, or within the register's

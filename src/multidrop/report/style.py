@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from multidrop.printable import printable
 from multidrop.recording.series import Array
 
-# Okabe and Ito's colours without black and yellow. Further drives get the same colours, dashed.
 MOST_DRIVES = 100  # limit of drives in a picture; tables list all drives
+# Okabe and Ito's colours without black and yellow; if they are used up, lines are dashed
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#555555")
 DASHES = ("solid", "dashed", "dotted", "dashdot")
 TEXT = "#555555"
@@ -44,9 +44,10 @@ class TimeBins:
         self.middles = days(((self._edges[1:] + self._edges[:-1]) / 2).astype(np.int64))
 
     def rates(self, time: Array, weights: Array | None = None) -> Array:
-        """Return for each bin the number of events per second, or the sum of their weights per second.
+        """Return the events per second in each bin; with `weights`, the sum of weights per second.
 
-        `time` has the time of each event."""
+        `time` has the time of each event.
+        """
         return np.asarray(np.histogram(time, self._edges, weights=weights)[0] / self._seconds)
 
     def label(self, axes: Axes) -> None:
@@ -56,13 +57,13 @@ class TimeBins:
 
 
 def label(text: str) -> str:
-    """Return the text, escaped so that matplotlib reads no formula and omits no legend entry."""
+    """Escape a text for matplotlib, which reads `$` as a formula and hides entries that start with `_`."""
     shown = printable(text).replace("$", r"\$")
     return f" {shown}" if shown.startswith("_") else shown
 
 
 def line_style(number: int) -> dict[str, Any]:
-    """Return matplotlib's colour and dashes for a drive's lines. They are the same in every picture."""
+    """Return the colour and dashes of the drive with this number, the same in every picture."""
     return {
         "color": COLOURS[number % len(COLOURS)],
         "linestyle": DASHES[number // len(COLOURS) % len(DASHES)],
@@ -70,14 +71,14 @@ def line_style(number: int) -> dict[str, Any]:
 
 
 class NotebookFigure(Figure):
-    """A figure that a notebook shows by itself, even without pyplot."""
+    """A figure that a notebook shows without pyplot."""
 
     def _repr_png_(self) -> bytes:
         return png(self)
 
 
 def new_figure(heights: Sequence[float], **details: Any) -> tuple[Figure, list[Axes]]:
-    """Return a figure and its axes, which lie one below the other and have these heights in inches."""
+    """Return a figure with axes of these heights (inches), one below the other."""
     figure = NotebookFigure(figsize=(WIDTH, sum(heights) + 0.6), layout="constrained", dpi=DPI)
     axes = figure.subplots(len(heights), 1, squeeze=False, height_ratios=list(heights), **details)[:, 0]
     for one in axes:
@@ -104,9 +105,7 @@ def add_legend(figure: Figure, handles: Sequence[Any]) -> None:
 
 
 def mark_times(axes: Axes, time: Array, height: float, apart: int, **details: Any) -> None:
-    """Draw a tick at each time, but only one tick in each interval of `apart` ns, because more would
-    overlap.
-    """
+    """Draw a tick at each time, but only one in each interval of `apart` ns."""
     if len(time):
         time = np.unique(time // max(1, apart)) * max(1, apart)
         axes.plot(days(time), np.full(len(time), height), "|", **details)

@@ -1,6 +1,4 @@
-"""Draw a recording's values: a panel per register name and unit, states as lanes, and marks for faults and
-misses.
-"""
+"""Draw a recording's values: curves, lanes of states, and marks for faults and misses."""
 
 from __future__ import annotations
 
@@ -132,9 +130,7 @@ def _of_drives(recording: Recording, drives: Sequence[str], registers: Sequence[
 
 
 def _faults(chosen: Sequence[Series], *, is_alone: bool) -> list[Series]:
-    """Return the fault series of drives that had faults. If only fault series were chosen, return all of
-    `chosen`.
-    """
+    """Return the fault series of drives that had faults; with `is_alone`, those of all drives."""
     polled = [series for series in chosen if series.register == FAULTS]
     return [series for series in polled if series.faults()] or (polled if is_alone else [])
 
@@ -276,9 +272,7 @@ def _mark_events(axes: Sequence[Axes], events: Sequence[Event]) -> None:
 
 
 def _shade(axes: Axes, content: Content, faults: Sequence[Series]) -> None:
-    """Shade the times of each drive's faults: across a panel with a curve of the drive, or across the drive's
-    lanes.
-    """
+    """Shade the times of a drive's faults behind its curves or lanes."""
     shade: dict[str, Any] = {"color": FAULT, "alpha": 0.08, "lw": 0}
     for one in faults:
         rows = [row for row, lane in enumerate(content.lanes) if lane.drive == one.drive]
@@ -297,8 +291,9 @@ def with_pauses(time: Array, value: Array, begins: Array) -> tuple[Array, Array]
 
 
 def thinned(time: Array, value: Array) -> tuple[Array, Array]:
-    """If there are more than MOST_POINTS points, return only the least and greatest value of each run of
-    rows. A run that has only misses keeps a miss.
+    """Reduce a long curve to the least and greatest value of each run of rows.
+
+    A run of misses keeps one miss.
     """
     pieces = MOST_POINTS // 2
     if len(time) <= MOST_POINTS:
@@ -313,7 +308,7 @@ def thinned(time: Array, value: Array) -> tuple[Array, Array]:
     return time[kept], value[kept]
 
 
-# Tol's pale colours, so that no state has the colour of a drive.
+# Tol's pale colours: no state has the colour of a drive
 COLOURS = ("#BBCCEE", "#CCDDAA", "#EEEEBB", "#CCEEFF", "#DDDDDD", "#FFCCCC")
 HATCHES = ("", "////", "....")  # patterns that distinguish states if there are more states than colours
 MOST_LANES = 64  # limit of lanes in a panel
@@ -441,7 +436,7 @@ def _style(number: int) -> dict[str, Any]:
 
 
 def _longest_first(lane: Lane) -> list[str]:
-    """Return the lane's states, the longest first, so that long states do not cover short ones when drawn."""
+    """Return the lane's states in drawing order: long states first, so that they do not cover short ones."""
     lasting = dict.fromkeys(lane.state, 0)
     for name, length in zip(lane.state, (lane.end - lane.begin).tolist(), strict=True):
         lasting[name] += length
@@ -449,9 +444,7 @@ def _longest_first(lane: Lane) -> list[str]:
 
 
 def _merged(lane: Lane, name: str, span: int) -> tuple[Array, Array]:
-    """Return the starts and ends of a lane's bars for this state. Bars whose gap would be invisible are
-    joined.
-    """
+    """Return the starts and ends of a state's bars. Bars with an invisible gap are joined."""
     of = np.array([state == name for state in lane.state])
     begin, end = lane.begin[of], lane.end[of]
     apart = np.concatenate([[True], begin[1:] - end[:-1] > span * NARROWEST / 2])

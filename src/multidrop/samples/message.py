@@ -1,4 +1,4 @@
-"""Messages: many rows as one Arrow IPC stream that any Arrow reader opens, two to three bytes a row.
+"""Messages: many rows packed into one Arrow IPC stream, in two to three bytes per row.
 
 | column           | type                        | meaning                                              |
 |------------------|-----------------------------|------------------------------------------------------|
@@ -49,7 +49,7 @@ MOST_MESSAGES = 100  # limit of Arrow messages in a stream: the schema, dictiona
 _DICTIONARY, _RECORD_BATCH = 2, 3  # kinds of Arrow messages, from MessageHeader in Message.fbs
 _I8, _U16, _I32, _U32, _I64 = (Struct(f"<{kind}") for kind in "bHiIq")
 _BUFFER = Struct("<qq")  # a buffer's offset in the body, and its length
-# in place of a buffer's unpacked size: the buffer is not compressed, because it would not shrink
+# unpacked size that marks a buffer as stored without compression
 _NOT_COMPRESSED = -1
 MOST_BYTES = 900_000  # size limit of a message; NATS accepts 1 MiB by default, including headers
 MOST_ROWS = 1 << 16
@@ -84,7 +84,7 @@ _KINDS |= {"drive": pa.uint16(), "register": pa.uint16(), "value": pa.float64(),
 
 
 def unpacked_size(data: bytes | memoryview) -> int:
-    """Return the size in bytes of all buffers after unpacking. Raises ValueError or pa.ArrowException."""
+    """Return how many bytes a message's buffers take unpacked. Raises ValueError or pa.ArrowException."""
     size = 0
     for number, message in enumerate(pa.ipc.MessageReader.open_stream(data)):
         if number == MOST_MESSAGES:
@@ -166,7 +166,7 @@ class Packed(NamedTuple):
 
 
 class RowBuffer:
-    """Holds copies of the rows of one poller's batches, so that the batches' memory can be reused."""
+    """Collects copies of polled rows until they are packed into messages."""
 
     def __init__(self) -> None:
         self.rows = 0
@@ -174,7 +174,7 @@ class RowBuffer:
         self._columns = {name: bytearray() for name in _KINDS}
 
     def add(self, columns: BatchColumns) -> bool:
-        """Copy the rows; return False if they are from another poller, which numbers names differently."""
+        """Copy the rows. Return False if they number drives or registers in another way than earlier rows."""
         names = {"drive": columns.drives, "register": columns.registers, "status": columns.statuses}
         if any(not _continues(names[of], known) for of, known in self._names.items()):
             return False
@@ -254,7 +254,7 @@ def _table(data: bytes | memoryview) -> Any:
     with pa.ipc.open_stream(data) as reader:
         for field in reader.schema:
             if not _is_ours(field):
-                raise ValueError(f"the column {field.name} has another type")
+                raise ValueError(f"the column {field.name} has the wrong type {field.type}")
         batches = []
         rows = 0
         for batch in reader:
@@ -272,7 +272,7 @@ def _is_ours(field: Any) -> bool:
 
 
 def _check(rows: Any) -> None:
-    """Raise ValueError for rows that no sink accepts. Otherwise they would block all later messages."""
+    """Raise ValueError for rows that a database would reject: they would block all later messages."""
     for field, column in zip(rows.schema, rows.columns, strict=True):
         if not field.nullable and column.null_count:
             raise ValueError(f"some rows have no {field.name}")
@@ -285,9 +285,9 @@ def _check_names(kind: str, names: Any) -> None:
     if names.null_count:
         raise ValueError(f"the column {kind} has a null text")
     if (pc.max(pc.binary_length(names)).as_py() or 0) > MOST_NAME:
-        raise ValueError(f"a {kind} is longer than {MOST_NAME} bytes")
+        raise ValueError(f"a text in the column {kind} is longer than {MOST_NAME} bytes")
     if pc.any(pc.match_substring(names, "\0")).as_py():
-        raise ValueError(f"a {kind} has a NUL character")
+        raise ValueError(f"a text in the column {kind} has a NUL character")
 
 
 def _microseconds(ns: Any) -> Any:

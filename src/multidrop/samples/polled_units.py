@@ -16,7 +16,7 @@ RAW = "raw count"  # unit of values whose scale is unknown, as in a `History`
 
 
 class UnitChange(NamedTuple):
-    """A change of a register's unit: before `until_ns` (monotonic, in ns), its unit had this `code`."""
+    """A change of a register's unit: until `until_ns` (monotonic), the unit was `code`."""
 
     until_ns: int
     series: int
@@ -26,8 +26,8 @@ class UnitChange(NamedTuple):
 class UnitTable(NamedTuple):
     """The unit of each register of each drive, as a code.
 
-    The values of one register of one drive are a series. Its number is drive * len(registers) + register,
-    with the codes of the two names.
+    The values of one register of one drive are a series. Series are numbered drive * len(registers) +
+    register, by the positions of the two names in their lists.
     """
 
     newest: Any  # pa.Array of the present unit code of each series; null if unknown
@@ -36,7 +36,7 @@ class UnitTable(NamedTuple):
 
 
 class PolledUnits:
-    """The units of all polled registers, and since when each register has its unit. Thread-safe."""
+    """The units of all polled registers, now and in the past. Thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -44,7 +44,7 @@ class PolledUnits:
         self._made: tuple[Sequence[str], Sequence[str], UnitTable] | None = None
 
     def note(self, line: PlantLine, since_ns: int) -> None:
-        """Note the units of this line for rows that are requested from `since_ns` (monotonic) on."""
+        """Set the units of a line's registers for requests sent at or after `since_ns` (monotonic)."""
         with self._lock:
             for polled in line.drives:
                 for poll in polled.series:
@@ -55,11 +55,8 @@ class PolledUnits:
             self._made = None
 
     def table(self, drives: Sequence[str], registers: Sequence[str]) -> UnitTable:
-        """Return the units of the drives' registers. The table is cached until lines or names change.
-
-        A message has nearly as many series as rows, so looking up each series' unit would cost more than
-        all other work on a row.
-        """
+        """Return the units of the drives' registers. The table is cached until lines or names change."""
+        # without the cache, looking up units would cost more than all other work on a row
         with self._lock:
             if self._made is None or self._made[:2] != (drives, registers):
                 self._made = drives, registers, self._make(drives, registers)

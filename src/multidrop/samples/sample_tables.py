@@ -209,7 +209,7 @@ def _array(kind: int, elements: list[bytes], *, has_nulls: bool) -> bytes:
 
 
 class SampleTables:
-    """A connection to a PostgreSQL database with these tables, for one writer.
+    """A connection that writes samples into a PostgreSQL database.
 
     `database` is a connection string, such as "dbname=plant"; `login` has further parameters of libpq. All
     methods raise psycopg.Error, which `sentences` converts to SinkError.
@@ -240,11 +240,8 @@ class SampleTables:
         return self._connection
 
     def prepare(self, position: str, columns: str) -> None:
-        """Create missing tables, including the writer's table for its position.
-
-        Then read all names that have an id.
-        """
-        # first query whether the object exists: "create if not exists" always needs the right to create it
+        """Create missing tables and read all stored names. `position` is the writer's own table."""
+        # query first whether a table exists: "create if not exists" needs the right to create it
         for query, name, statement in (
             ("select to_regnamespace(%s)", "multidrop", "create schema if not exists multidrop"),
             ("select to_regclass(%s)", "multidrop.samples", TABLES),
@@ -259,13 +256,13 @@ class SampleTables:
     def insert(self, tables: Iterable[Any]) -> None:
         """Insert rows from tables with the columns of `message.ROWS`."""
         found: list[ExchangeRows] = [exchanges_of(table) for table in tables]
-        self._name(found)
+        self._insert_names(found)
         with self.connection.cursor() as cursor, cursor.copy(COPY) as copy:
             for piece in copied(found, self._drives, self._sets):
                 copy.write(piece)
 
-    def _name(self, found: Sequence[ExchangeRows]) -> None:
-        """Insert the names that have no id in the database yet."""
+    def _insert_names(self, found: Sequence[ExchangeRows]) -> None:
+        """Insert the drives and register sets that are not in the database yet."""
         drives = sorted({name for one in found for name in one.drives} - self._drives.keys())
         query = "insert into multidrop.drives (name) select unnest(%s::text[]) returning name, id"
         if drives:
@@ -279,7 +276,7 @@ class SampleTables:
 
 @contextmanager
 def sentences() -> Iterator[None]:
-    """Convert PostgreSQL's errors to SinkError with one sentence."""
+    """Convert errors of PostgreSQL to SinkError."""
     try:
         yield
     except psycopg.Error as failure:

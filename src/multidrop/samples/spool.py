@@ -115,7 +115,7 @@ class SpoolFolder:
                 path.unlink()
             elif match := _NAME.fullmatch(path.name):
                 number = int(match[1])
-                # counts damaged messages too, so that their numbers are not reused
+                # damaged messages count too, so that their numbers are not reused
                 self.newest = max(self.newest, number)
                 if match[3] == "arrows":
                     found[number] = StoredMessage(number, int(match[2]), path.stat().st_size, path)
@@ -164,8 +164,7 @@ class SpoolState(NamedTuple):
 
     log: str  # id of the log, from `spool.json`
     written: int  # number of rows that reached the disk
-    # rows that were dropped before they reached the disk, or removed from the disk before they were sent
-    lost: int
+    lost: int  # number of rows dropped because the disk is slow, or removed from it before they were sent
     waiting: int  # rows that wait in memory
     oldest: int  # sequence number of the oldest message; 0 if there is none
     newest: int
@@ -226,7 +225,7 @@ class Spool:
     # ---- for the poller: any thread ----
 
     def append(self, batch: Batch) -> None:
-        """Copy the rows, which the spool's thread will write. Takes microseconds, whatever the disk does."""
+        """Copy the rows; the spool's thread writes them later. This never waits for the disk."""
         columns = batch.columns()
         with self._changing:
             rows = len(columns.time)
@@ -252,7 +251,6 @@ class Spool:
         return self._thread.is_alive()
 
     def state(self) -> SpoolState:
-        """Return the counts of the spool's messages and rows, and its present problem."""
         with self._changing:
             oldest = next(iter(self._folder.messages), 0)
             counts = self._written, self._lost, self._in_memory(), oldest, self._folder.newest
@@ -284,9 +282,9 @@ class Spool:
             return self._folder.messages.get(sequence)
 
     def acknowledge(self, sequence: int, missing: Sequence[tuple[int, int]] = ()) -> None:
-        """Note that the receiver has all messages up to this sequence number: removing them loses no rows.
+        """Note that the receiver has all messages up to this sequence number, except those in `missing`.
 
-        `missing` are exceptions, as pairs of the first and the last sequence number.
+        `missing` has ranges of sequence numbers, each as its first and its last number.
         """
         with self._changing:
             self._acknowledged, self._missing = sequence, missing

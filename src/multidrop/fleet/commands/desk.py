@@ -53,8 +53,8 @@ from multidrop.fleet.servers.connections import ServerPath
 from multidrop.plant import drive_meant
 from multidrop.supervisor import supervisor
 
-HOLD_S = 0.5  # an answer waits this long for a command or stop to end, then says "under way"
-AWAITED_S = 3.0  # time limit for commands in progress before their line is closed; most commands are faster
+HOLD_S = 0.5  # a command or stop that takes longer is answered with "under way"
+AWAITED_S = 3.0  # how long the closing of a line waits for its commands in progress
 POLL_S = 0.01  # pause between checks whether commands have ended
 MOST_WRITES = 8  # limit of concurrent commands on one line; stops are not counted
 WAY = "fleet"  # name in the audit log for commands that came through the fleet
@@ -89,9 +89,9 @@ class CommandDesk:
     # ---- offering a command ----
 
     def offer(self, line: str, data: bytes) -> Offered | CommandAnswer | None:
-        """Check a command message; return an offer, or an answer with the reason why the command is refused.
+        """Check a command message; return an offer, or an answer with the reason for a refusal.
 
-        Return None unless this gateway is the line's master: the sender uses the first answer that it gets.
+        Return None if another gateway is the line's master.
         """
         held = self._lines.for_command(line)
         if held is None:
@@ -106,10 +106,10 @@ class CommandDesk:
     # ---- carrying out an offered command ----
 
     async def do(self, data: bytes) -> CommandAnswer:
-        """Carry out an offered command once; return its result, also for copies of the confirmation.
+        """Carry out an offered command once and return its result.
 
-        A message with `ask` instead of `do` only requests the result. If `ask` comes before any `do`, answer
-        "not sent", and withdraw the offer so that this answer stays true.
+        A message with `ask` instead of `do` only requests the result. If no `do` came before, the offer is
+        withdrawn and the answer is "not sent".
         """
         try:
             message = read_json(data)
@@ -130,7 +130,7 @@ class CommandDesk:
         return found._replace(gateway=self.gateway)
 
     async def await_commands(self, line: str, may_wait: Callable[[], bool]) -> None:
-        """Wait for commands in progress on a line, for at most AWAITED_S and while `may_wait()` is True."""
+        """Wait for a line's commands to end, at most AWAITED_S and only while `may_wait()` is True."""
         loop = asyncio.get_running_loop()
         ends = loop.time() + AWAITED_S
         while self._under_way.get(line) and loop.time() < ends and may_wait():
@@ -212,10 +212,7 @@ def _prepared(held: HeldLine, request: CommandRequest) -> Prepared:
 
 
 class StopDesk:
-    """Stops drives of this gateway's lines.
-
-    Each stop cancels all earlier offers of commands to its drives.
-    """
+    """Stops drives of this gateway's lines, and cancels commands that were offered for these drives."""
 
     def __init__(self, gateway: str, lines: HeldLines, offers: Offers, log: CommandLog) -> None:
         self.gateway = gateway
@@ -233,8 +230,8 @@ class StopDesk:
         a message without an id is always a new stop.
 
         A stop that takes longer than HOLD_S is answered with "under way" and its progress; the sender then
-        asks again. Return None if this gateway has released or lost the line in the meantime and motors still
-        run: the line's next master answers.
+        asks again. Return None if a motor still runs and this gateway has released or lost the line: the
+        line's next master answers.
         """
         held = self._lines.for_stop(line)
         if held is None:
@@ -304,7 +301,7 @@ class StopDesk:
         return answer
 
     def _note(self, record: Mapping[str, Any]) -> None:
-        """Write a record of a stop to the log in a task. Records keep the order of the calls."""
+        """Log a record of a stop in a task, after all earlier records."""
         supervisor().start("note of a stop", self._write(record))
 
     async def _write(self, record: Mapping[str, Any]) -> None:

@@ -45,7 +45,7 @@ _log = logging.getLogger("multidrop.fleet")
 
 
 def _ignore(answer: CommandAnswer) -> None:
-    """Ignore the progress of a stop. This is the default for callers that need only the final answer."""
+    """Ignore a report of a stop's progress."""
 
 
 class FleetCommands:
@@ -93,11 +93,11 @@ class FleetCommands:
     # ---- commands ----
 
     async def preview(self, request: CommandRequest) -> Offered | CommandAnswer:
-        """Return the offer or refusal of the line's master for a command; the command is not carried out."""
+        """Return the gateway's offer or refusal for a command, without carrying it out."""
         return await self._offer(await self._line_of(request.drive), request)
 
     async def write(self, drive: str, register: str, value: float | str) -> CommandAnswer:
-        """Write a register once. A named value is given by its name or its raw count.
+        """Write a register once. `value` may be a number, or the name of a value such as "forward".
 
         Raises ValueError if the drive is not in the plant, FleetError if the plant cannot be read.
         """
@@ -156,10 +156,7 @@ class FleetCommands:
         return CommandAnswer(CommandOutcome.NOT_SENT, f"{request.words} was not sent: {why}")
 
     async def _do(self, offered: Offered) -> CommandAnswer:
-        """Confirm the offered command once and return its result.
-
-        If no answer comes, request only the result.
-        """
+        """Confirm an offered command once, and return its result."""
         path = self._path()
         try:
             message = await path.request(offered.subject, json.dumps({"do": offered.token}).encode())
@@ -206,10 +203,10 @@ class FleetCommands:
     ) -> CommandAnswer:
         """Stop these drives, or all drives of the plant if None; the lines are stopped in parallel.
 
-        With `line` the plant is not read, and the drives are those of the line. `by` replaces this object's
-        `by` in the logs. If a stop takes longer than half a second, `on_news` is called in the event loop
-        with the stop's progress, and again whenever it changes. A drive that is not in the plant gets the
-        answer "refused"; the other drives are stopped.
+        With `line`, only drives of that line are stopped, and the plant is not read. `by` replaces this
+        object's `by` in the logs. If a stop takes longer than half a second, `on_news` is called in the event
+        loop with the stop's progress, and again whenever it changes. A drive that is not in the plant gets
+        the answer "refused"; the other drives are stopped.
 
         Raises ValueError if none of the drives is in the plant, FleetError if the plant cannot be read. In
         both cases no stop was sent.
@@ -284,8 +281,8 @@ class FleetCommands:
     async def _read_plant(self, otherwise: str) -> None:
         """Update the local copy of the plant from the servers.
 
-        If the servers fail, keep the old copy, because masters check each command. Without an
-        old copy, raise FleetError with a message that starts with `otherwise`.
+        If no server answers, keep the old copy: the gateways check each command against their own. Without an
+        old copy, raise FleetError; its message starts with `otherwise`.
         """
         try:
             await self._plant.look()

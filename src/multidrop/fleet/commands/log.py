@@ -13,7 +13,7 @@ from multidrop.control import AuditLog
 from multidrop.supervisor import supervisor
 
 WRITING_S = 10.0  # time limit for writing a record; after it, the disk is reported as hanging
-CLOSING_S = 1.0  # how long, in s, `close` waits for the record that is being written
+CLOSING_S = 1.0  # how long `close` waits for a record that is being written
 
 
 class CommandLog:

@@ -141,7 +141,7 @@ def read_stop(data: bytes) -> tuple[StopRequest, str]:
 
 
 def spelt(given: object) -> str:
-    r"""Return a name as printable text, whatever its type; an escape character becomes `\x1b`."""
+    r"""Convert a received name to printable text, such as `\x1b` for an escape character."""
     text = str(given) if isinstance(given, (str, int, float)) else ""
     return (text if text.isprintable() else repr(text)[1:-1]).strip()[:MOST_CHARACTERS]
 

@@ -115,7 +115,7 @@ class Offers:
         return len(self._by_token)
 
     def make(self, request: CommandRequest, prepared: Prepared, held: HeldLine) -> Offer:
-        """Return a new offer for a checked request; for a copy of an earlier request, the earlier offer."""
+        """Return an offer for a checked request. A copy of a request gets the same offer."""
         known = self._by_request.get((held.name, request.id))
         if known is not None and known.request == request:
             return known
@@ -130,10 +130,7 @@ class Offers:
         return self._by_token.get(token)
 
     def take(self, offer: Offer) -> bool:
-        """Mark the offer as taken.
-
-        Return True only at the first call, so that the command is carried out once.
-        """
+        """Mark the offer as taken; return True only at the first call, so that it is carried out once."""
         is_first = not offer.is_taken
         offer.is_taken = True
         return is_first
@@ -165,6 +162,6 @@ class Offers:
             )
 
     def end(self, offer: Offer, answer: CommandAnswer) -> None:
-        """Set the result of an offered command. Later copies of its message get this result too."""
+        """Set the result of an offered command. Copies of its message get this result too."""
         offer.answer = answer
         offer.over.set()

@@ -327,8 +327,9 @@ async def put_end(bucket: Bucket, end: Record) -> None:
 class LifeLock:
     """A lock on a local file, which this process holds until it ends.
 
-    So the next holder knows that this process is dead. The file holds a random id, because containers may
-    share the machine id and the path. Raises FleetError if another process of this computer holds the lock.
+    A process that gets the lock knows that the previous holder is dead. The file holds a random id, because
+    containers may share the machine id and the path. Raises FleetError if another process of this computer
+    holds the lock.
     """
 
     def __init__(self, path: Path) -> None:
@@ -359,8 +360,7 @@ class LifeLock:
 def machine_id() -> str:
     """Return an id of this computer's present boot; "" if it is unknown.
 
-    With an unknown id, no process can be proved to be dead. Computers with copies of one disk have the same
-    machine id and lock file, but different boot ids.
+    Computers with copies of one disk have the same machine id and lock file, but different boot ids.
     """
     with suppress(OSError):
         ids = [path.read_text("utf-8", "replace").strip() for path in IDS]

@@ -149,7 +149,7 @@ class Member:
 
     @property
     def wanted(self) -> Mapping[str, str]:
-        """The lines and the gateway that each is assigned to."""
+        """The gateway to which each line is assigned."""
         return self._shares.wanted
 
     @property
@@ -322,7 +322,7 @@ class Member:
             self.keeper.reconcile()
 
     def _note_others(self, present: Mapping[str, Mapping[str, Any]]) -> set[str]:
-        """Return the other gateways that poll lines, and note the time if this set has changed."""
+        """Return the other gateways that may poll lines."""
         self._incompatible.look(present)
         self.keeper.may_claim = not self._incompatible.gateways
         others = {name for name, value in present.items() if not value["draining"]}

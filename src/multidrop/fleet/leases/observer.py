@@ -77,7 +77,7 @@ class Observer:
     def _note(self, path: int, record: Record) -> None:
         watched = self._watched[path]
         before = watched.get(record.key)
-        # The waiting time starts at the last renewal. An end that another gateway wrote does not restart it.
+        # a record that another gateway marked as ended is not a renewal: keep the time of the last renewal
         if before is not None and is_ended_by_another(record):
             watched[record.key] = before._replace(revision=record.revision)
         else:
@@ -87,7 +87,7 @@ class Observer:
         return [follower.records.get(gateway) for follower in self.paths]
 
     def is_over(self, gateway: str, session: int) -> bool:
-        """Return True if enough lease records of this session were ended for the session to be over."""
+        """Return True if this session is over because enough of its lease records were ended."""
         if session <= self._over.get(gateway, 0):
             return True
         now = self._clock()
@@ -95,7 +95,7 @@ class Observer:
         return lease_rules.is_over(sum(ended), self.terms)
 
     def sessions(self) -> dict[str, dict[str, Any]]:
-        """Return each gateway whose session is not over, with its newest lease record."""
+        """Return the newest lease record of each gateway whose session is not over."""
         found = {}
         now = self._clock()
         for name in sorted({name for follower in self.paths for name in follower.records}):
@@ -148,7 +148,7 @@ class Observer:
         return not is_ended_by_another(record) or self._is_stale(path, record, now)
 
     def unseen_s(self, gateway: str) -> float:
-        """Return how many seconds ago renewals of two lease records of this gateway were last seen."""
+        """Return for how many seconds this gateway has not renewed two of its lease records."""
         seen = [watched[gateway].since for watched in self._watched if gateway in watched]
         latest = sorted(seen, reverse=True)[: self.terms.needed]
         return (self._clock() - latest[-1]) / lease_rules.SECOND if latest else 0.0

@@ -44,7 +44,7 @@ class SeenRevision(NamedTuple):
 
 
 def deadline(sent: Iterable[int | None], terms: Terms) -> int:
-    """Return the time (ns) until which the holder may send; 0 if too few lease records were renewed.
+    """Return the deadline for sending (ns); 0 if too few lease records were renewed.
 
     `sent` has an entry for each record: when its newest acknowledged renewal was sent, or None.
     """

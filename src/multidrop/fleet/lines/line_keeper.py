@@ -138,7 +138,7 @@ class LineKeeper:
         return None if line in self._at_work else self._owners.claim_of(line)
 
     def may_stop(self, line: str) -> bool:
-        """Return True if this gateway is the line's master now, even if `may_command` is still False."""
+        """Return True if this gateway is the line's master now."""
         return self._lease.is_valid and self.is_mine(line) and line in self.polled
 
     def may_command(self, line: str) -> bool:
@@ -292,7 +292,7 @@ def _some_at_once(lines: Iterable[str]) -> Iterator[list[str]]:
 
 
 class OwnerRecords:
-    """The ownership records that name this gateway's present session, and the writing of such records.
+    """Reads and writes the ownership records of this gateway's lines.
 
     Records are written only while `may_write()` returns True. `on_mine` is called with each line that this
     gateway now owns.
@@ -330,7 +330,7 @@ class OwnerRecords:
         return votes >= NEEDED
 
     def doubted(self, line: str) -> set[str]:
-        """Return the buckets to which this line's release was sent, if its outcome is unknown."""
+        """Return the NATS buckets in which this gateway may have released the line: no answer has come."""
         return {
             bucket
             for bucket, record in self._records.of(line).items()
@@ -355,10 +355,8 @@ class OwnerRecords:
         return claim_of(self._me, self._records.of(line), is_over, self.doubted(line), self._leaderless())
 
     def _leaderless(self) -> set[str]:
-        """Return the ownership bucket, if any, that may have no leader.
-
-        If its home server has failed, the lease record with the same home server is not renewed.
-        """
+        """Return the ownership buckets whose NATS server seems to have failed."""
+        # the same server has a lease bucket, so this gateway's record there is not renewed
         sent = [path.sent if path else 0 for path in self._lease.held]
         since = sorted(sent)[1] - LAG_NS
         return {bucket for bucket, moment in zip(names.OWNERS, sent, strict=True) if moment < since}
@@ -366,8 +364,7 @@ class OwnerRecords:
     async def claim(self, claims: Mapping[str, Claim]) -> None:
         """Write the `first` records of these claims, and also the `spare` records if a bucket answers late.
 
-        A refused claim is repeated soon with newer records. So after a refusal, do not wait for further
-        answers, which a bucket without a leader would not give.
+        After a refusal, do not wait for further answers: the claim is repeated soon with newer records.
         """
         now_ms, begun = time.time_ns() // 1_000_000, time.monotonic()
         values = {

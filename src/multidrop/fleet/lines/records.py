@@ -144,8 +144,7 @@ class FleetRecords:
         if turn != seen:
             self._masters[line] = master, turn
             known = before if turn == seen + 1 else None
-            # equal if a gateway has claimed its own line again after an uncertain release
-            if known != master:
+            if known != master:  # equal if a gateway claims its own line again after an uncertain release
                 self.moves.add([Move(line, turn, record.value["since"], known, master)])
 
 
@@ -180,7 +179,7 @@ class ShareFollower(Follower):
         self._is_urgent.set()
 
     def recompute(self) -> None:
-        """Determine again, before the next read, which lines must be read."""
+        """Before the next read, determine again which lines must be read."""
         self._asked = None
 
     async def look(self) -> list[Record]:

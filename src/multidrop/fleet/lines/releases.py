@@ -35,8 +35,7 @@ class Releases:
         self._on_change = on_change
         self._clock = clock
         self._has_lines = False
-        # The buckets that have a leader: by bucket, the time (s) since which one of its servers is silent;
-        # None if all of its servers answer.
+        # by bucket that has a leader: when one of its servers became silent (s); None if all servers answer
         self._led: dict[str, float | None] = {}
 
     def due(self, lines: Set[str], wait_s: float = SILENT_SERVER_S) -> set[str]:

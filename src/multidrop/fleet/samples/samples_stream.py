@@ -58,7 +58,7 @@ class LastMessage(NamedTuple):
     """The newest message of a subject."""
 
     place: int  # the message's position in the stream
-    sequence: int  # number in the gateway's log; 0 if a client has directed a server's answer to this subject
+    sequence: int  # number in the gateway's log; 0 if the message is not from a gateway
     digest: str
 
 
@@ -200,8 +200,8 @@ def _checked_fields() -> Iterator[None]:
 class StreamMessage(NamedTuple):
     """A message as the hub reads it. `sequence` is 0 if the message cannot be from a gateway.
 
-    Then its header is missing or invalid, or the message is a server's answer to a read: a client that may
-    read stored messages can direct such answers to any subject, and so into the samples of another gateway.
+    Then its header is missing or invalid, or the message is a server's answer to a read. A client can direct
+    such an answer to any subject, so also into the samples of a gateway.
     """
 
     place: int

@@ -24,7 +24,7 @@ WHOLE = ("204", "404")
 
 
 class DirectMessage(NamedTuple):
-    """A message in a stream, as a direct get returns it."""
+    """A stored message that JetStream has returned from a stream."""
 
     subject: str
     sequence: int
@@ -59,7 +59,7 @@ class Gathered:
 
 
 class DirectGet(Gathered):
-    """The messages that one direct get returns."""
+    """Collects the stored messages that answer one direct get, which is a read request to JetStream."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -102,7 +102,10 @@ class BatchClient(Client):
         self._subscribing = asyncio.Lock()
 
     async def batch(self, request: Request, get: DirectGet, silence_s: float) -> None:
-        """Collect the answer to a direct get. Raises OSError if it is incomplete, and nats-py's errors."""
+        """Collect the messages that answer a read request.
+
+        Raises OSError for an incomplete answer, and nats-py's errors.
+        """
         await self._ask([request], [get.take], get, silence_s)
         if not get.last.done():
             raise TimeoutError(f"the server sent no message for {silence_s:g} s")

@@ -1,7 +1,7 @@
-"""Buckets of records by key. A record is replaced only at a known revision.
+"""Buckets of records by key, each in a NATS stream. A record is replaced only at a known revision.
 
-Records are read without a NATS consumer. Any user with write access to a bucket can write any bytes. So
-records have a known shape: an invalid record is ignored, and does not affect other records.
+Records are read without a NATS consumer. Any user with write access to a bucket can write any bytes, so each
+record is checked. An invalid record is ignored, and does not affect other records.
 """
 
 from __future__ import annotations
@@ -219,7 +219,7 @@ class Bucket:
         return f"$KV.{self.name}.{key}"
 
     def _pattern(self, key: str) -> str:
-        """Return the pattern of all subjects of a key. The newest message among them is its record."""
+        """Return a pattern that matches each NATS subject on which the key's record may be written."""
         return self._subject(key)
 
     def _record(self, subject: str, revision: int, data: bytes) -> Record:
@@ -241,7 +241,7 @@ OnTake = Callable[[Record | None, Record], object]
 
 
 class Follower:
-    """A local copy of a bucket's records by key, as far as they were read.
+    """A local copy of a bucket's records by key.
 
     `on_take` is called with the former and the new record whenever a newer record was read.
     """

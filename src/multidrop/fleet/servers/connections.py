@@ -73,8 +73,7 @@ class ServerPath:
         self._pong_s = pong_s
         self._client: BatchClient | None = None
         self._denials = Denials()
-        # the failure that was logged last; "" if none was logged since the connection worked
-        self._trouble = ""
+        self._trouble = ""  # the last logged failure; "" while the connection works
         self._leaving: set[asyncio.Task[None]] = set()
         self._wanted: dict[str, Callable[[Msg], Any]] = {}  # the function to call with messages, by subject
         self._standing: dict[str, Subscription] = {}  # active subscriptions at the present server, by subject
@@ -219,15 +218,15 @@ class ServerPath:
             raise OutcomeUnknown(f"{self.url} gave no answer to {subject}: {failure}") from None
 
     async def collect(self, subject: str, data: bytes) -> list[DirectMessage]:
-        """Return all messages of a direct get. Raises the errors of `request`.
+        """Return the stored messages that answer a read request. Raises the errors of `request`.
 
-        If this connection is slow, repeat the request on the other connections.
+        If this connection is slow, the request is repeated on the other connections.
         """
         paths = [self, *(other for other in self.others if other.is_open)]
         return await first_answer(paths, Request(subject, data), self.budget)
 
     async def gather(self, request: Request, get: DirectGet, silence_s: float = ANSWER_S) -> None:
-        """Collect the messages of a direct get on this connection only. Raises the errors of `request`."""
+        """Collect the stored messages that answer a read request. Raises the errors of `request`."""
         client, denials = self._connected(), self._denials
         before = denials.of_request(request.subject)
         try:

@@ -35,7 +35,7 @@ from multidrop.whole_file import whole_file
 
 MOST_ROWS = 2000  # limit of rows in one request or MQTT message, about 250 kB of JSON
 NOT_FINITE = "not a finite number"  # status of a row whose value JSON and InfluxDB cannot represent
-REMOVED_S = 0.01  # pause in s after the full spool has removed the message that was about to be sent
+REMOVED_S = 0.01  # pause in s if the spool is full and has just removed the next message
 # limit of gaps. A gap is a range of messages that were skipped in order to send a newer message first.
 MOST_GAPS = 64
 SET_BACK = (
@@ -82,8 +82,9 @@ def row_objects(rows: Any) -> list[dict[str, Any]]:
 
 
 class SpoolPosition(NamedTuple):
-    """The messages that a receiver has: all up to number `newest`, except the ranges (first, last) in
-    `gaps`.
+    """The messages that a receiver has: all up to number `newest`, except those in `gaps`.
+
+    A gap is a pair of the first and the last missing number.
     """
 
     newest: int = 0
@@ -136,9 +137,7 @@ class RowReceiver(Protocol):
 
 
 class RepeatingReceiver:
-    """A receiver whose position is kept in a file in the spool's folder.
-
-    Such a receiver may get a message twice.
+    """A receiver that may get a message twice: its position is kept in a file in the spool's folder.
 
     `deliver(message)` returns once the message's rows have arrived. It may raise the errors of `write`.
     """
@@ -267,8 +266,7 @@ class RowForwarder(RetryingSender):
         return None
 
     def _is_refused_alone(self, sequence: int) -> bool:
-        """Return True if this message was refused twice, and another message was accepted between the
-        refusals.
+        """Return True if this message was refused twice, and another one was accepted in between.
 
         If no other message was accepted, a wrong setting may be the cause. Skipping each refused message
         would then lose all messages.
@@ -332,11 +330,7 @@ class Forwarding:
         self._note_units(self._adopted_ns)
 
     def _without_former_drives(self, batch: Batch) -> Batch:
-        """Return the batch without rows that the previous plant polled from drives that the new plant
-        changes.
-
-        Such rows were requested before the new plant was adopted, so their units are unknown.
-        """
+        """Return the batch without rows of changed drives from before the reload: their units are unknown."""
         columns = batch.columns()
         former = {code for code, name in enumerate(columns.drives) if name in self._changed}
         rows = enumerate(zip(columns.drive, columns.monotonic_ns, strict=True))
@@ -389,9 +383,7 @@ class Forwarding:
         return "; ".join(filter(None, found))
 
     def figures(self) -> list[MetricFamily]:
-        """Return metrics: numbers of rows sent, lost and refused since the start, and of messages not
-        sent yet.
-        """
+        """Return metrics: rows sent, lost and refused since the start, and messages not sent yet."""
         state, sent, name = self._spool.state(), self._forwarder, f"multidrop_{self._name}"
         gauges = {
             f"{name}_backlog_messages": ("Stored messages that are not sent yet.", sent.behind),

@@ -1,6 +1,4 @@
-"""The gateway's part `influx`: sends all polled values in InfluxDB's line protocol, to a server over
-HTTP or to standard output.
-"""
+"""The gateway's part `influx`: sends all polled values in InfluxDB's line protocol, by HTTP or to stdout."""
 
 from __future__ import annotations
 
@@ -69,9 +67,7 @@ def build(settings: InfluxSettings, context: PartContext) -> Forwarding:
             lines = line_protocol(rows, settings.measurement)
             if settings.url == STDOUT:
                 left = memoryview(lines)
-                # bypass Python's buffer, which stays locked while the program that reads standard output
-                # hangs
-                while left:
+                while left:  # without Python's buffer, which stays locked while the reading program hangs
                     left = left[os.write(sys.stdout.fileno(), left) :]
             else:
                 post(settings.url, gzip.compress(lines, 1), headers)

@@ -214,9 +214,7 @@ class Turns:
 
 
 class WatchedProtocol(H11Protocol):
-    """An HTTP connection that detects a client which sends requests without waiting for answers, or does
-    not read answers.
-    """
+    """An HTTP connection that reports a client which does not wait for answers, or does not read them."""
 
     @property
     def _connections(self) -> Connections:

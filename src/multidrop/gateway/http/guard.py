@@ -66,9 +66,7 @@ class RouteAccess(NamedTuple):
 
 
 class Guard:
-    """Passes allowed requests to `app`, with the caller in the scope's key `caller`; refuses all other
-    requests.
-    """
+    """Refuses forbidden requests; passes the others to `app`, with the caller in the scope's key `caller`."""
 
     def __init__(
         self,

@@ -65,9 +65,7 @@ class Caller(NamedTuple):
         return self._replace(command=given)
 
     def stopping(self, given: object = None) -> Caller:
-        """Return the same as `commanding`, but replace an invalid id by a new one, so that no stop is
-        refused.
-        """
+        """Return this caller with `given` as the id of a stop; an invalid id is replaced by a new one."""
         try:
             return self.commanding(given)
         except ValueError:
@@ -191,8 +189,7 @@ class May(NamedTuple):
 
 
 def caller_with(token: Token | None, free: Right | None, way: str, address: str) -> Caller | None:
-    """Return a caller with the larger of two rights: that of its token, and `free`, the right without a
-    token.
+    """Return a caller with the right of its token, or with `free`, the right without a token, if larger.
 
     Return None if the caller has neither right.
     """

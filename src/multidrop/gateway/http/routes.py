@@ -91,9 +91,7 @@ def make_app(gateway: Gateway) -> ASGIApp:
     others = Starlette(routes=routes, exception_handlers=handlers)
 
     async def app(scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer requests for frames without the router, because they are by far the most frequent
-        requests.
-        """
+        """Answer requests for frames, which are the most frequent ones, without the router."""
         await (pages.frame if scope["path"] == FRAME else others)(scope, receive, send)
 
     return Guard(
@@ -148,9 +146,7 @@ def _answer(caller: Caller, result: CommandResult) -> Response:
 
 
 def _answer_all(caller: Caller, results: Mapping[str, CommandResult]) -> Response:
-    """Return the HTTP answer with the result of each drive's stop, with status 404 if all drives are
-    unknown.
-    """
+    """Return the HTTP answer with each drive's result; its status is 404 if all drives are unknown."""
     if results and all(isinstance(one.error, UnknownDrive) for one in results.values()):
         return _error(404, "; ".join(one.text for one in results.values()))
     return JsonResponse({name: _fields(one, caller) for name, one in results.items()})
@@ -370,11 +366,7 @@ class Pages(PageFiles):
         return _answer(caller, await acting)
 
     def _admission(self, drive: str, command: object, body: Mapping[str, Any]) -> Admit:
-        """Return a function that admits a command only if its sender saw a recent frame; see
-        `SeenFrames.admit`.
-
-        Stops need no frame.
-        """
+        """Return a function that admits a command only if its sender has seen a recent frame of values."""
         frames = self._gateway.seen_frames
         return lambda what: frames.admit(drive, what, (drive, command), frame_in(body))
 

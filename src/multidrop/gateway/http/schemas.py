@@ -14,16 +14,12 @@ Schema = Mapping[str, Any]
 
 
 def record(texts: str = "", /, **fields: Schema) -> Schema:
-    """Return the schema of an object with these required keys; `texts` names the keys whose values are
-    strings.
-    """
+    """Return the schema of an object with these required keys; `texts` has the keys of strings."""
     return {**some(texts, **fields), "required": [*texts.split(), *fields]}
 
 
 def some(texts: str = "", /, **fields: Schema) -> Schema:
-    """Return the schema of an object with these optional keys; `texts` names the keys whose values are
-    strings.
-    """
+    """Return the schema of an object with these optional keys; `texts` has the keys of strings."""
     return {"type": "object", "properties": dict.fromkeys(texts.split(), TEXT) | fields}
 
 

@@ -27,8 +27,7 @@ from multidrop.toml_check import DURATION, Key, TomlPlace, duration_of
 STOPPED, PORT, LIMIT = "stopped", "port", "limit"  # kinds of alarms, besides FAULT and SILENT
 KINDS = (FAULT, STOPPED, LIMIT, PORT, SILENT)  # kinds of alarms, the most serious kind first
 UNCALLED = "the motor stopped, and no stop was called here"
-# in ms: a motor counts as stopped after this time at rest; a motor that reverses also passes 0 Hz, but
-# briefly
+# in ms: a motor counts as stopped after this time at rest, because a motor that reverses also passes 0 Hz
 STANDS_MS = 2000
 MOST_ENDED = 1000  # limit of ended alarms that the gateway remembers
 MOST_SHOWN = 20  # limit of ended alarms that clients see
@@ -153,9 +152,7 @@ class Alarms:
         self._stands.pop(drive, None)
 
     def look_at_line(self, time: int, line: str, lost: str | None) -> None:
-        """Start the alarm about a line's lost port, with the reason `lost`; if `lost` is None, end the
-        alarm.
-        """
+        """Start the alarm about a line's lost port with the reason `lost`, or end it if `lost` is None."""
         if lost is None:
             self._end(time, line, "", PORT)
         else:

@@ -130,8 +130,7 @@ class SideReads:
 
 
 class Identities:
-    """Checks each drive's identity once while its port is open, so that the drive's first stop need not wait
-    for the check.
+    """Checks each drive's identity in advance, so that its first stop need not wait for the check.
 
     `fail` is called in the `except` block of an unexpected exception, so that it can log the exception.
     """

@@ -100,8 +100,7 @@ def _drive(hub: Hub, name: str, time_ns: int) -> dict[str, Any]:
 
 
 def _age_ms(now: Times, asked: Times) -> int:
-    """Return the age in ms of a request sent at `asked`: the larger of the ages by UTC and by
-    CLOCK_MONOTONIC.
+    """Return the age of a request in ms: the larger of its ages by UTC and by CLOCK_MONOTONIC.
 
     UTC may be set back, and CLOCK_MONOTONIC stops while the computer sleeps. Both make an age too small.
     """

@@ -62,9 +62,7 @@ class RegisterRows:
         self.good: KeptRow | None = None
 
     def is_current(self, now_ns: int, woke_ns: int) -> bool:
-        """Return True if the newest value is not too old, and was requested after the computer's last
-        sleep.
-        """
+        """Return True if the newest value is not too old, and is from after the computer's last sleep."""
         good = self.good
         return good is not None and good[1] >= woke_ns and now_ns - good[1] <= self.holds_ns
 
@@ -387,9 +385,7 @@ class Hub:
         return Shown(UNKNOWN, INCOMPLETE if any(name not in fresh for name in watched.cells) else None, note)
 
     def _unseen(self, watched: _WatchedDrive) -> Shown:
-        """Return the state of a drive without fresh values: SILENT, or UNKNOWN if it replied or was not
-        polled.
-        """
+        """Return the state of a drive without fresh values: UNKNOWN if it replied recently, else SILENT."""
         newest = [cell.newest for cell in watched.cells.values() if cell.newest]
         misses = [row for row in newest if row[3] != 0]
         if not misses or len(misses) < len(watched.cells):
@@ -440,7 +436,7 @@ def _forget_trip(watched: _WatchedDrive) -> None:
 
 
 def _words(register: Register[Any], value: float) -> str:
-    """Return a value as text: the name of a named value, else the register's name and the number."""
+    """Return a fault as text, such as "overcurrent"; "last fault: 7" if the value has no name."""
     if register.values is not None:
         return register.in_words(register.decode(value))
     return f"{register.name.replace('_', ' ')}: {register.format(value)}"
@@ -460,9 +456,7 @@ def published_value(register: Register[Any], value: float) -> float | str:
 
 
 def published_values(hub: Hub, drive: str) -> dict[str, float | str | None]:
-    """Return the values of a drive's polled registers by name; None for stale, infinite and missing
-    values.
-    """
+    """Return a drive's polled values by register; None for a value that is stale, infinite or missing."""
     return {
         register.name: published_value(register, good[2])
         if is_current and good is not None and newest is good and isfinite(good[2])

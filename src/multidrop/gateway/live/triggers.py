@@ -1,6 +1,4 @@
-"""The gateway's part `trigger`: conditions over polled values, and the last moment at which each became
-true.
-"""
+"""The gateway's part `trigger`: conditions over polled values, and when each last became true."""
 
 from __future__ import annotations
 
@@ -21,7 +19,7 @@ from multidrop.polling import slot_rows
 from multidrop.supervisor import supervisor
 from multidrop.toml_check import DURATION, parse_duration
 
-ADOPT_S = 30.0  # time limit, in s, for checking the conditions against a new plant
+ADOPT_S = 30.0  # time limit, in s, for preparing the conditions after a reload of the plant file
 LONGEST_NAME = 60  # limit of a trigger's name, in characters
 EXAMPLE = 'conditions = { trip = "pump-1.output_current > 30" }'
 TEXTS = {"additionalProperties": {"type": "string", "minLength": 1}, "minProperties": 1}
@@ -97,17 +95,12 @@ class Triggers:
             _log.info("trigger %s: %s", trigger.name, trigger.condition)
 
     def adopt(self, plant: Plant) -> None:
-        """Use another plant; its rows are used once `run` has checked the conditions against it in a
-        thread.
-        """
+        """Use another plant. No condition is evaluated until `run` has prepared them for this plant."""
         self._plant, self._conditions = plant, None
         self._is_new.set()
 
     async def run(self) -> None:
-        """Check the conditions against each plant that is adopted.
-
-        Raises ValueError if a condition does not fit the plant.
-        """
+        """Prepare the conditions for each adopted plant. Raises ValueError if one does not fit the plant."""
         while True:
             await self._is_new.wait()
             self._is_new.clear()

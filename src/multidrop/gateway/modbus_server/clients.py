@@ -25,9 +25,7 @@ from multidrop.supervisor import supervisor
 
 SLICE = 64  # limit of requests of one client that are answered in one turn
 SLICE_S = 0.002  # limit, in s, of the duration of one client's turn
-# limit, in s, of the duration of a round, in which each busy client has a turn; a stop waits at most this
-# long
-ROUND_S = 0.004
+ROUND_S = 0.004  # in s: in this time each busy client has a turn, so a stop waits at most this long
 MOST_CLIENTS = 64  # limit of clients per TCP port
 MOST_BEHIND = 1 << 18  # limit, in bytes, of the requests of one client that wait for a turn
 MOST_UNTAKEN = 1 << 18  # limit, in bytes, of the answers that one client has not read yet
@@ -47,8 +45,7 @@ Answer = bytes | Awaitable[bytes] | None
 
 
 class ModbusClient(asyncio.Protocol):
-    """One client's connection. Each answer has the transaction id of its request, and is sent as soon as it
-    is ready.
+    """One client's connection. Each answer is sent as soon as it is ready.
 
     Writes start when they arrive, in their order. Other requests wait for the client's turn.
     """
@@ -186,9 +183,7 @@ class ModbusClient(asyncio.Protocol):
         return bool(self._waiting) and self._stalled_since is None
 
     def _answered(self, request: MbapRequest) -> bytes:
-        """Return the answer to a request if it is known already; b"" if it follows later, or if there is
-        none.
-        """
+        """Return the answer to a request; b"" if it follows later, or if there is none."""
         answer = self._port.serve(request, self)
         if isinstance(answer, bytes):
             return answer

@@ -55,9 +55,7 @@ class _WaitingRead:
 
 
 class LineShare:
-    """Sends the requests of all clients on one line: one at a time, in order, within a share of the
-    line's time.
-    """
+    """Sends the requests of clients on one line, one at a time, within a share of the line's time."""
 
     def __init__(self, share: float = SHARE) -> None:
         self._loop = asyncio.get_running_loop()
@@ -133,9 +131,7 @@ class LineShare:
         self._filled = now
 
     async def _run(self, asked: _WaitingRead) -> None:
-        """Carry out a request to its end, even if its client disconnects, because the line stays busy
-        until then.
-        """
+        """Carry out a request to its end, even if its client disconnects: the line is busy until then."""
         begun = self._loop.time()
         try:
             result = await asked.work(asked.expires - begun)

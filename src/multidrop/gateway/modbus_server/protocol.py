@@ -187,9 +187,7 @@ def read_range(request: MbapRequest) -> range:
 
 
 def reply_data(function: int, words: list[int]) -> bytes:
-    """Return the data of a reply: words, or bits packed into bytes, the first bit in the least
-    significant place.
-    """
+    """Return the data of a reply: words, or bits packed into bytes with the first bit lowest."""
     if function in (3, 4):
         return struct.pack(f">B{len(words)}H", 2 * len(words), *words)
     size = (len(words) + 7) // 8

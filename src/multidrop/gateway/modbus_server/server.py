@@ -1,7 +1,4 @@
-"""Modbus TCP server: answers the requests of clients such as SCADA systems.
-
-Reads are answered with polled values if possible.
-"""
+"""Modbus TCP server: answers clients such as SCADA systems, with polled values if possible."""
 
 from __future__ import annotations
 
@@ -120,9 +117,7 @@ class ModbusServer:
     # ---- requests ----
 
     def serve(self, port: str, request: MbapRequest, client: ModbusClient) -> Answer:
-        """Return the answer to a request, or an awaitable of it; None for a broadcast, which is not
-        allowed.
-        """
+        """Return the answer to a request, or an awaitable of it; None for a broadcast: it is not allowed."""
         if request.unit == 0:
             return None
         unit = self._units.find(port, request.unit)

@@ -220,9 +220,7 @@ class Unit:
         return self._writable.get((carrier, address))
 
     def has_stop_in(self, written: WriteRequest, common_stop: int | None) -> bool:
-        """Return True if a request contains a write that stops the motor: to a register, or to the
-        address `common_stop`.
-        """
+        """Return True if a request writes a value that stops the motor, or any but 0 to `common_stop`."""
         carrier, start, size, data = written
         for at in range(size):
             if carrier is Carrier.WORD and start + at == common_stop and data[2 * at : 2 * at + 2] != b"\0\0":
@@ -301,9 +299,7 @@ def _by_port(plant: Plant, settings: ModbusSettings) -> Mapping[str, Mapping[int
 
 
 def _clashes(port: str, units: Mapping[int, list[Unit]]) -> Iterator[str]:
-    """Yield an error sentence for each duplicate or invalid unit id on a TCP port, and one that lists
-    the free ids.
-    """
+    """Yield an error for each duplicate or invalid unit id on a TCP port, and a sentence with free ids."""
     where = "" if port == MAIN else f" on the port of line {port}"
     wrong: list[str] = []  # names of the drives with an invalid unit id
     for number, found in sorted(units.items()):
@@ -335,9 +331,7 @@ def _ranges(numbers: Iterable[int]) -> str:
 
 
 def _overlap(unit: Unit, settings: ModbusSettings) -> Iterator[str]:
-    """Yield an error sentence for each overlap of the common block, the channel block and the drive's
-    registers.
-    """
+    """Yield an error if the common block, the channels and the drive's registers share an address."""
     channels = range(settings.channels, settings.channels + unit.channels.length)
     if channels.stop > 0x10000 or set(channels) & (unit.holding_addresses() | set(settings.common_addresses)):
         yield (

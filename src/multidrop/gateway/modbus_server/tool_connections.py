@@ -1,6 +1,4 @@
-"""Connections of drive vendors' tools, as pseudo-terminals or over TCP, and the RTU requests in their
-bytes.
-"""
+"""Connections of drive vendors' PC tools, by pseudo-terminal or TCP, and the RTU requests in their bytes."""
 
 from __future__ import annotations
 

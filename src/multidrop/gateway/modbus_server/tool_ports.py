@@ -1,7 +1,8 @@
-"""Tool ports: pass the requests of drive vendors' tools on to the drives of a line, in the line's spare time.
+"""Tool ports: interfaces through which a drive vendor's PC tool reaches the drives of a line.
 
 A tool port behaves like the line itself: a request to an unused address, or to a silent drive, gets no reply.
-Reads are sent to the drive one at a time. Writes obey the same rules as those of Modbus TCP clients.
+Reads are sent to the drive one at a time, in the line's spare time. Writes obey the same rules as those of
+Modbus TCP clients.
 """
 
 from __future__ import annotations
@@ -99,9 +100,7 @@ class ToolSettings:
         refuse(self._mistakes())
 
     def check(self, plant: Plant) -> list[str]:
-        """Return an error sentence for each line in `pty` or `rtu` that is not in the plant, or has no
-        Modbus drives.
-        """
+        """Return an error for each line in `pty` or `rtu` that is unknown or has no Modbus drives."""
         lines = {line.name: line for line in plant.lines}
         return [*self._line_mistakes(lines)] if lines else []
 
@@ -159,11 +158,10 @@ def build(settings: ToolSettings, context: PartContext) -> ToolPorts:
 
 
 class Tool:
-    """A connected tool. Only its newest request is answered, because a tool sends one only after it has given
-    up the previous one.
+    """A connected PC tool of a drive vendor. Only its newest request is answered.
 
-    A reply that comes later than `timeout` s after its request is dropped, because the tool could take it for
-    the reply to its next request.
+    A tool sends a request only after it has given up the previous one. A reply that comes more than `timeout`
+    seconds after its request is dropped, because the tool could take it for the reply to its next request.
     """
 
     is_full = False  # the number of writes is limited for the line, not for a single tool
@@ -192,9 +190,7 @@ class Tool:
             self._loop.call_later(PAUSE_S, self._listen)
 
     def _take_in(self) -> bool:
-        """Read the received bytes and start the requests in them; return False if the tool has
-        disconnected.
-        """
+        """Read received bytes and start their requests; return False if the tool has disconnected."""
         try:
             data = self._end.read()
         except OSError as failure:
@@ -390,9 +386,9 @@ def _asked(request: MbapRequest) -> tuple[int, int]:
 
 
 class ToolPorts:
-    """The tool ports of a plant: for each line a pseudo-terminal, a TCP port, or both.
+    """The ports through which drive vendors' PC tools reach the lines of a plant.
 
-    Relative paths of pseudo-terminals are relative to `folder`.
+    A line has a pseudo-terminal, a TCP port, or both. Relative paths start from `folder`.
     """
 
     def __init__(

@@ -58,9 +58,7 @@ class Unavailable(Enum):
 
 
 def is_fresh(row: Newest | None, now_ns: int, since_ns: int = 0) -> bool:
-    """Return True if a read succeeded, its value is not too old, and it was requested at `since_ns` or
-    later.
-    """
+    """Return True if a read succeeded, its value is not too old, and it was not sent before `since_ns`."""
     if row is None or row.value is None:
         return False
     return row.monotonic_ns >= since_ns and now_ns - row.monotonic_ns <= row.holds_ns
@@ -134,8 +132,7 @@ class _PolledRegister:
         self._data: bytes | None = None
 
     def word(self, row: Newest | None, at: int, now_ns: int, since_ns: int) -> int | Unavailable:
-        """Return the word at the offset `at` in the register's newest value (of a coil: the bit), or why it
-        is unknown.
+        """Return the word at the offset `at` in the register's newest value, or why it is unknown.
 
         Failed reads, stale values and values requested before `since_ns` are not used.
         """
@@ -283,9 +280,7 @@ class CommonBlock:
         return row.value if row and is_fresh(row, now_ns, woke_ns) else None
 
     def _fault(self, hub: Hub, now_ns: int, woke_ns: int, state: str) -> int:
-        """Return the number that the drive's family gives the present fault, or one of the reserved
-        fault numbers.
-        """
+        """Return the drive's own number of the present fault, or one of the reserved fault numbers."""
         if state != "fault":
             return NO_FAULT if state in ("stands", "runs") else FAULT_UNKNOWN
         value = self._fresh_value(hub, now_ns, woke_ns, "fault", "")

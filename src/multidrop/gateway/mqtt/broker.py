@@ -310,7 +310,7 @@ class Broker:
         for topic, qos in self._speaker.topics():
             self._client.subscribe(topic, qos)
         self.failure = ""  # a failure of the previous connection does not matter now
-        self.outbox.forget()  # drop old messages, because the speaker's first message must be its birth
+        self.outbox.forget()  # drop old messages: in Sparkplug, the first message must be a birth
         self.publish_all()
 
     def _acknowledge(self) -> None:

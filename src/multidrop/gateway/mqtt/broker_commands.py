@@ -1,9 +1,8 @@
-"""BrokerCommands: check the commands that a broker delivers. A broker may delay, retain and duplicate
-messages.
+"""BrokerCommands: check and carry out the commands that an MQTT broker delivers.
 
-A write or a verb is carried out only if it is not a copy and was sent at most MOST_AGE_S ago. It must also
-have been sent after the latest stop of its drive and the latest reload of the plant file. A verb that stops
-the motor is always carried out.
+A broker may delay, retain and duplicate messages. So a write or a verb is carried out only if it is not a
+copy and was sent at most MOST_AGE_S ago. It must also have been sent after the latest stop of its drive and
+the latest reload of the plant file. A verb that stops the motor is always carried out.
 """
 
 from __future__ import annotations

@@ -215,8 +215,7 @@ class JsonTopics:
         self._commands.refuse(drive, "/".join(what), why, named)
 
     def _to_stop(self, drive: str, given: Mapping[str, Any]) -> list[str]:
-        """Return the drive that the topic names, and also the drive that the message names if it is another
-        one.
+        """Return the drive that the topic names, and another drive if the message names one.
 
         Stopping too many drives is harmless, stopping none is not.
         """

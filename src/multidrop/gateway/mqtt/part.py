@@ -1,6 +1,4 @@
-"""The gateway's part `mqtt`: publishes values to a broker, and accepts commands from it if the plant
-file allows them.
-"""
+"""The gateway's part `mqtt`: publishes values to a broker, and accepts the commands that the plant allows."""
 
 from __future__ import annotations
 

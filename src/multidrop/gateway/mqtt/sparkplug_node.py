@@ -238,9 +238,7 @@ class SparkplugNode:
         return found
 
     def _times(self, drive: str) -> dict[str, int]:
-        """Return the time of each metric (UTC in ms): when its current value was polled, or now if there
-        is none.
-        """
+        """Return the time of each metric (UTC, ms): when its value was polled, or now without a value."""
         now = self._utc_ms()
         times = dict.fromkeys(self._values(drive), now)
         for register, newest, good, is_current in self._hub.known(drive):

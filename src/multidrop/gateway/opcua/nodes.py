@@ -132,9 +132,7 @@ def fault_of(shown: hub.Shown) -> tuple[int, str | None]:
 
 
 class _Variant(ua.Variant):
-    """A number or a text with its OPC UA type. asyncua's check is skipped, because the type is known to
-    be right.
-    """
+    """A number or a text with its OPC UA type. asyncua's check of the type is skipped."""
 
     __slots__ = ()
 
@@ -383,9 +381,7 @@ def _unit(parent: ua.NodeId, node: ua.NodeId, unit: str) -> ua.AddNodesItem:
 def _method(
     parent: ua.NodeId, node: ua.NodeId, results: ua.NodeId, description: str
 ) -> Iterator[ua.AddNodesItem]:
-    """Yield the requests to add two nodes: a method without arguments that returns a text, and the
-    description of this text.
-    """
+    """Yield the requests to add a method that returns a text, and the description of this text."""
     attributes = ua.MethodAttributes()
     attributes.Description = ua.LocalizedText(description)
     attributes.Executable = attributes.UserExecutable = True

@@ -260,9 +260,7 @@ class OpcUa:
                 gc.unfreeze()
 
     def _caller(self, visitor: Visitor) -> Caller | None:
-        """Return a session's user as a caller with the user's present rights; None if the user may not
-        read.
-        """
+        """Return a session's user with their present rights; None if the user may not read values."""
         tokens, may, address = self._context.tokens, self._context.commands.may, visitor.address
         token = None
         if visitor.secret and tokens:  # a gateway without tokens ignores the token that a user sends

@@ -86,9 +86,7 @@ Stop = Callable[[ua.CallMethodRequest, Visitor], Awaitable[ua.CallMethodResult]]
 
 
 class _Admission(UserManager, SimpleRoleRuleset):
-    """Admits users when they log in, and again at each request, because a reload may have revoked their
-    token.
-    """
+    """Admits users at login, and again at each request, because a reload may have revoked their token."""
 
     def __init__(self, admit: MayRead) -> None:
         super().__init__()

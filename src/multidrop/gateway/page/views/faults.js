@@ -41,7 +41,7 @@ export async function show() {
     list = find("#fault-list");
   if (sign === shown && (now() - shownAt < 5000 || list.contains(document.activeElement))) return;
   [shown, shownAt] = [sign, now()];
-  const kinds = Object.keys(ALARMS), // the gravest kind first
+  const kinds = Object.keys(ALARMS), // the most serious kind first
     rank = ({ kind, acknowledged }) => [acknowledged ? 1 : 0, kinds.indexOf(kind)].join(),
     lasting = found
       .filter(alarm => alarm.ended === null)
