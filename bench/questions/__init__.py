@@ -1,1 +1,1 @@
-"""Each script of this package answers one question by measurements."""
+"""Scripts that each answer one question by measurements, in folders by topic."""

@@ -14,7 +14,7 @@ import pytest
 from multidrop.drive.text import Text, text
 
 ROOT = Path(__file__).parents[2]
-SCRIPT = [sys.executable, "-m", "bench.questions.coverage"]
+SCRIPT = [sys.executable, "-m", "bench.questions.files.coverage"]
 
 HELD = [  # entries that the register model can describe
     {"name": "voltage", "reg_type": "input", "address": "0x10", "format": "s16", "scale": 0.1},
@@ -50,7 +50,7 @@ def wb(channels: list[dict[str, Any]], **device: Any) -> str:
 @pytest.fixture
 def bench(monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.syspath_prepend(str(ROOT))
-    return importlib.import_module("bench.questions.coverage")
+    return importlib.import_module("bench.questions.files.coverage")
 
 
 def covered(bench: Any, folder: Path) -> Any:

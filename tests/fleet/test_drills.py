@@ -1,7 +1,7 @@
 """Drills with real processes that are killed or suspended: no line ever has two masters.
 
 The simulated drives record all requests, and count overlaps of two masters on a line. `python -m
-bench.questions.fleet_drills --rounds 40` runs more drills.
+bench.questions.fleet.drills --rounds 40` runs more drills.
 """
 
 from __future__ import annotations

@@ -36,7 +36,9 @@ def test_the_help_of_a_tool_is_the_comment_at_its_start(tool: str) -> None:
 
 
 BENCHMARKS = [
-    path.stem for path in (ROOT / "bench" / "questions").glob("*.py") if "def main(" in path.read_text()
+    f"{path.parent.name}.{path.stem}"
+    for path in (ROOT / "bench" / "questions").glob("*/*.py")
+    if "def main(" in path.read_text()
 ]
 PRINT_HELP = """
 import importlib, sys
@@ -72,7 +74,8 @@ def test_paths_in_ci_scripts_exist() -> None:
     echo = subprocess.run(
         ["bash", "-c", f"printf '%s\\n' {' '.join(patterns)}"], cwd=ROOT, capture_output=True, text=True
     )
-    paths = {*echo.stdout.splitlines(), *(f"bench/questions/{name}.py" for name in benchmarks())}
+    scripts = (f"bench/questions/{name.replace('.', '/')}.py" for name in benchmarks())
+    paths = {*echo.stdout.splitlines(), *scripts}
     assert len(paths) > 100
     assert [path for path in sorted(paths) if not (ROOT / path).exists()] == []
 

@@ -188,7 +188,7 @@ def test_many_threads_can_read_poll_and_change_lines_concurrently() -> None:
     program = [
         sys.executable,
         "-m",
-        "bench.questions.many_at_once",
+        "bench.questions.safety.many_at_once",
         "--lines=6",
         "--drives=5",
         "--minutes=0.08",

@@ -1,6 +1,6 @@
 """A suspended master sends no byte on lines that another master took over, as seen at their far ends.
 
-`python -m bench.questions.fence` repeats this test 2,000 times.
+`python -m bench.questions.safety.fence` repeats this test 2,000 times.
 """
 
 from __future__ import annotations

@@ -316,7 +316,7 @@ def test_the_fleet_command_line_can_write_a_setpoint_and_stop_a_drive(drill: Com
 
 
 def test_80_commands_are_carried_out_once_and_get_true_answers(drill: CommandDrill) -> None:
-    """The long version of this test is `python -m bench.questions.fleet_commands --commands 6000`."""
+    """The long version of this test is `python -m bench.questions.fleet.commands --commands 6000`."""
     before = {drive: drill.setpoints(drive) for drive in drill.sims}
     found = asyncio.run(drill.ask(80, 10.0))
     assert (found.twice, found.wrongly, found.unnoted) == (0, 0, 0)

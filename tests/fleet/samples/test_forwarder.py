@@ -374,7 +374,7 @@ ROOT = Path(__file__).parents[3]
 def chaos(monkeypatch: pytest.MonkeyPatch) -> Any:
     require_module("duckdb")
     monkeypatch.syspath_prepend(str(ROOT))
-    return importlib.import_module("bench.questions.fleet_chaos")
+    return importlib.import_module("bench.questions.fleet.chaos")
 
 
 def test_the_check_after_random_kills_finds_lost_and_duplicated_rows(chaos: Any) -> None:

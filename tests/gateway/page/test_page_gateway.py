@@ -68,7 +68,7 @@ def test_a_killed_gateway_is_reported(page: Any) -> None:
 
 
 def test_the_delay_of_values_over_a_network_of_8_kb_a_second_does_not_grow(page: Any, tmp_path: Path) -> None:
-    """`python -m bench.questions.page` measures the delay itself."""
+    """`python -m bench.questions.gateway.page` measures the delay itself."""
     with served(tmp_path, "", *(f"drive-{n}" for n in range(1, 13))) as gateway:
         page.goto(f"http://localhost:{gateway.gateway.port}/")
         until(page, LIVE)

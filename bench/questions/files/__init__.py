@@ -1,0 +1,1 @@
+"""Questions about recordings, captures, histories and family files."""

@@ -1,0 +1,1 @@
+"""Questions about a fleet: several gateways that share lines."""

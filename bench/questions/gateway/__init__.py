@@ -1,0 +1,1 @@
+"""Questions about one gateway (`multidrop serve`), its page and its interfaces."""

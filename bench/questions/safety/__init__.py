@@ -1,0 +1,1 @@
+"""Questions about wrong values, failed stops, and errors in long runs."""
