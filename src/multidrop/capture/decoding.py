@@ -58,9 +58,7 @@ class Decoding:
             yield from line.rest()
 
     def counts(self) -> Counter[str]:
-        """Return how many exchanges, frames, unknown bytes and so on were decoded so far, on all lines
-        together.
-        """
+        """Return the numbers of decoded exchanges, frames, unknown bytes and so on, of all lines together."""
         return sum((Counter(line.decoder.counts()) for line in self._lines), Counter())
 
 
@@ -137,9 +135,7 @@ _DELIXI_WRITES = {0x02: (0x02,), 0x04: (0x04,), 0x05: (0x05, 0x06), 0x06: (0x05,
 
 @dataclass(frozen=True)
 class RegisterPlace:
-    """A register (None if unknown) and its offset in an exchange's data. The offset is in words, or in bits
-    for coils.
-    """
+    """A register (None if unknown) and its offset in the data, in words, or in bits for coils."""
 
     name: str
     at: int
@@ -157,9 +153,7 @@ class RequestTarget:
 
 
 def line_of(plant: Plant | None, name: str) -> PlantLine | None:
-    """Return the plant's line with this name. If the plant has only one line, return it whatever the name
-    is.
-    """
+    """Return the plant's line with this name. The only line of a plant is returned for any name."""
     lines = plant.lines if plant else ()
     named = [line for line in lines if line.name == name]
     return named[0] if named else lines[0] if len(lines) == 1 else None

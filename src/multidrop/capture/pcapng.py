@@ -169,7 +169,7 @@ _NO_SERIAL_LINE = {1: "Ethernet", 101: "IP", 105: "Wi-Fi", 113: "Linux cooked", 
 
 
 class CaptureError(ValueError):
-    """A file is not a capture, or is damaged; the message has the position of the damage."""
+    """Raised for a file that is not a capture, or is damaged; the message has the damage's position."""
 
 
 class Capture:

@@ -14,8 +14,7 @@ MOST_POINTS = 100_000
 _BEFORE_ALL, _AFTER_ALL = -(1 << 64), 1 << 64  # in ns: before and after the time of every row
 # an empty bucket: number of values, number of failed reads; sum, least and greatest of the values
 _EMPTY = 0, 0, 0.0, math.inf, -math.inf
-# Buckets shorter than this are computed from rows. Longer buckets are computed from ten-second summaries, at
-# a hundredth of the cost.
+# Shorter buckets are computed from rows, longer ones from ten-second summaries at a hundredth of the cost.
 FINE_NS = 2 * SECOND_NS
 
 
@@ -67,9 +66,7 @@ class Grid:
         return self.step % TEN_NS == 0 and self.begin % TEN_NS == 0
 
     def bucket_of(self, time: int) -> tuple[int, int, int]:
-        """Return index, start and end of the bucket that contains `time`; if `time` is outside the grid,
-        the index is -1.
-        """
+        """Return index, start and end of the bucket that contains `time`; outside the grid, index -1."""
         if time < self.begin:
             return -1, _BEFORE_ALL, self.begin
         if time >= self.end:
@@ -115,9 +112,7 @@ class Accumulator:
         self._least, self._most = [math.inf] * grid.points, [-math.inf] * grid.points
 
     def add(self, bucket: int, n: int, missed: int, total: float, least: float, most: float) -> None:
-        """Add `n` values and `missed` failed reads to the bucket at this index. `total`, `least` and `most`
-        are the sum, least and greatest of the values.
-        """
+        """Add `n` values, with their sum, least and greatest value, and `missed` failed reads to a bucket."""
         self._missed[bucket] += missed
         if n:
             self._n[bucket] += n
@@ -126,9 +121,7 @@ class Accumulator:
             self._most[bucket] = max(self._most[bucket], most)
 
     def add_rows(self, times: Iterable[int], values: Iterable[float], valid: Iterable[int]) -> None:
-        """Add rows with times in ns. A row that is not valid is a failed read. Rows outside the grid are
-        skipped.
-        """
+        """Add rows with times in ns; rows outside the grid are skipped. An invalid row is a failed read."""
         grid, bucket, begin, end = self._grid, -1, 0, 0
         n, missed, total, least, most = _EMPTY
         for time, value, is_valid in zip(times, values, valid, strict=True):
@@ -175,8 +168,9 @@ def _where(has: Sequence[int], values: Sequence[float]) -> list[float | None]:
 
 
 class UnitBuckets:
-    """The buckets of one register, separately for each unit that its rows state. Rows of `multidrop hub`
-    state their unit.
+    """The buckets of one register, separately for each unit in its rows.
+
+    Only the rows that `multidrop hub` stores have a unit of their own.
     """
 
     def __init__(self, grid: Grid) -> None:

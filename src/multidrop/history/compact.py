@@ -37,7 +37,7 @@ from {} group by all order by drive, register, time
 """
 MERGED = "select * exclude filename from {} order by drive, register, time"
 MERGED_ROWS = "select * exclude filename from {} order by drive, time"
-MOST_MERGED = 200_000_000  # limit in bytes of the files in `rows/` that are merged into one file
+MOST_MERGED = 200_000_000  # limit in bytes for the files of `rows/` that are merged into one
 
 
 def main(words: list[str] | None = None) -> int:
@@ -60,9 +60,10 @@ def main(words: list[str] | None = None) -> int:
 
 
 def compact(folder: Path, below: int, *, merge_rows: bool = False) -> None:
-    """Convert segments with numbers under `below` to Parquet, and merge the ten-second summaries of each past
-    hour and day. With `merge_rows`, also merge the rows of each past hour, and compute missing summaries for
-    files in `rows/`.
+    """Convert the segments below this number to Parquet, and merge the summaries of past hours and days.
+
+    A summary is ten seconds of a register. With `merge_rows`, also merge the rows of each past hour, and
+    compute missing summaries for files in `rows/`.
     """
     for name in ("rows", "tens", "damaged"):
         (folder / name).mkdir(exist_ok=True)

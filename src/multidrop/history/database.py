@@ -1,6 +1,4 @@
-"""Use DuckDB for the history, with limited memory and one thread. Rows are passed as Arrow in both
-directions.
-"""
+"""DuckDB for the history, with limited memory and one thread. Rows are passed in Arrow's layout."""
 
 from __future__ import annotations
 
@@ -158,9 +156,7 @@ def kept_metadata(database: Any, path: Path) -> dict[str, Any]:
 
 
 def texts_of_metadata(database: Any, paths: Iterable[Path]) -> Iterator[tuple[str, list[str]]]:
-    """For each different metadata text in these Parquet files, yield the text and the names of the files with
-    it.
-    """
+    """Yield each metadata text in these Parquet files, with the names of the files that have it."""
     query = f"""select decode(value), list(file_name) from parquet_kv_metadata({_list(paths)})
         where decode(key) = $key group by value"""
     yield from database.execute(query, {"key": METADATA_KEY}).fetchall()
@@ -176,8 +172,9 @@ def files_of(paths: Iterable[Path]) -> str:
 
 
 def with_units(paths: Iterable[Path]) -> str:
-    """Return the SQL that reads Parquet files as one table with the file names. Files without the column
-    `unit` have null in it.
+    """Return the SQL that reads Parquet files as one table with the columns `filename` and `unit`.
+
+    `unit` is null for files without this column.
     """
     files = f"read_parquet({_list(paths)}, union_by_name = true, filename = true)"
     return f"(select * from {files} union all by name select null::varchar as unit where false)"

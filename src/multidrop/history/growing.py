@@ -32,7 +32,7 @@ class SeriesTens:
         self.by_number: dict[int, Ten] = {}  # key: ten-second intervals since 1970
 
     def add(self, time: int, value: float | None) -> None:
-        """Add a row. None is a failed read."""
+        """Add a row; the value None is a failed read."""
         ten = self.by_number.setdefault(time // TEN_NS, [0, 0, 0.0, float("inf"), float("-inf")])
         if value is None:
             ten[1] += 1
@@ -171,9 +171,7 @@ def _is_valid(columns: RecordedColumns, at: int) -> bool:
 def _codes(
     drives: tuple[str, ...], registers: tuple[str, ...], series: frozenset[Series]
 ) -> frozenset[tuple[int, int]]:
-    """Return a pair of codes for each series: the index of its drive in `drives`, and of its register in
-    `registers`.
-    """
+    """Return the indexes of each series' drive in `drives` and of its register in `registers`."""
     known = {drive for drive, _ in series}
     return frozenset(
         (drive_code, code)
@@ -267,8 +265,6 @@ class KeptSeries:
         return sum(len(rows.times) for rows in self._kept.values())
 
     def _found(self, series: Series, batches: range) -> SeriesRows:
-        """Return a series' cached rows if the batch `batches.start` is in them or follows them, else an empty
-        entry.
-        """
+        """Return a series' cached rows if `batches` starts within or directly after them, else no rows."""
         rows = self._kept.pop(series, None)
         return rows if rows and rows.first <= batches.start <= rows.past else SeriesRows(batches.start)

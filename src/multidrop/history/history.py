@@ -98,7 +98,7 @@ class History:
         return HistoryRows(self, parsed_series(series), first, ALWAYS[1] if end is None else ns_of(end))
 
     def parting_of(self, series: Sequence[Series] | None, begin: int, end: int) -> Parting:
-        """Return the newest and the earlier units of the series (None: all series) in this range."""
+        """Return the newest and the earlier quantities of the series (None: all series) in this range."""
         parting = Parting({}, series)
         self._sources.again(lambda found: self._learnt(found, series, begin, end, parting))
         return parting

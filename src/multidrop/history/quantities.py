@@ -1,6 +1,7 @@
-"""The quantity (unit, or names of values) of each series in each segment of a history, from the metadata. A
-series is a register of a drive. In a new segment, its name may belong to another drive or family. Values of
-different quantities are never combined.
+"""The quantity of each series in each segment of a history, from the metadata.
+
+A series is a register of a drive; its quantity is a unit, or the names of its values. In a new segment, its
+name may belong to another drive or family. Values of different quantities are never combined.
 """
 
 from __future__ import annotations
@@ -18,9 +19,7 @@ RAW, NAMED = "raw count", "names"
 
 
 class Quantity(NamedTuple):
-    """What a register's values measure: a unit ("" for none), or, for an enumeration, the names of its
-    numbers.
-    """
+    """What a register's values measure: a unit ("" for none), or the names of an enumeration's numbers."""
 
     unit: str
     names: tuple[tuple[str, object], ...] = ()

@@ -36,9 +36,7 @@ FILES_AT_ONCE = 200  # files per query of metadata, because a file's metadata ma
 
 
 class Replaced(Exception):
-    """A listed file no longer exists: compaction moved its rows to another file, or the file was removed
-    because of its age.
-    """
+    """A listed file no longer exists, because its rows were moved to another file or were too old."""
 
 
 class Sources:
@@ -69,7 +67,8 @@ class Sources:
 
     @contextmanager
     def segment(self, number: int, found: Listing, begin: int, end: int) -> Iterator[GrowingSegment | None]:
-        """Yield a segment that was read up to its current end. Its file stays open during the `with` block.
+        """Yield a segment that was read up to its current end, and whose file stays open in the `with` block.
+
         Yield None if the segment has no rows in this range or cannot be read. Raises Replaced.
         """
         segment: GrowingSegment | None = None
@@ -92,9 +91,7 @@ class Sources:
                 segment.let_go()
 
     def _held(self, number: int, path: Path) -> GrowingSegment | None:
-        """Return a segment, whose `let_go` the caller must call. The indexes of the newest segments are
-        cached.
-        """
+        """Return a segment, with cached indexes if it is one of the newest. The caller must call `let_go`."""
         segment = self._growing.get(number)
         if segment is None:
             try:
@@ -199,8 +196,9 @@ def rows_of_file(
     end: int,
     renamed: Iterable[OtherColumn],
 ) -> Iterator[Rows]:
-    """Yield the rows of the series (None: all series) by request time. Raises Replaced only before the first
-    row.
+    """Yield the rows of the series (None: all series) by request time.
+
+    Raises Replaced, but only before the first row.
     """
     condition, values = _condition(series)
     with sources.cursor() as cursor, while_there([file]):
@@ -237,8 +235,9 @@ def gather_files(
 def units_in_rows(
     sources: Sources, files: Sequence[HistoryFile], series: Sequence[Series] | None, begin: int, end: int
 ) -> dict[int, Known]:
-    """Return the quantities in each file, by the number of its first segment, from the column `unit` of its
-    rows. Raises Replaced.
+    """Return the quantities in each file's column `unit`, by the number of its first segment.
+
+    Raises Replaced.
     """
     condition, values = _condition(series)
     query = _UNITS.format(files=with_units(file.path for file in files), condition=condition)

@@ -22,7 +22,7 @@ from multidrop.transport import clock
 MOST_WAITING = 250_000  # limit of rows (12 MB) that wait for a slow disk; further rows are dropped
 WRITING_S = 0.4  # time between writes: each write makes a batch, and many small batches slow down queries
 TENDING_S = 60.0  # time between removals of old files, in s
-HANGING_S = 5.0  # a write that takes longer than this (in s) is reported
+HANGING_S = 5.0  # time in s after which a write is reported as too slow
 ENDING_S = 10.0  # how long `close` waits for the disk
 
 _log = logging.getLogger("multidrop.history")
@@ -65,9 +65,8 @@ class HistoryWriter:
         self._compactor = Compactor(self.folder)
         self._waiting: list[GatheredRows] = []
         self._waiting_rows = 0
-        self._ended: list[
-            tuple[list[GatheredRows], Metadata]
-        ] = []  # for each ended segment: its unwritten rows, and the next segment's metadata
+        # for each ended segment: its unwritten rows, and the next segment's metadata
+        self._ended: list[tuple[list[GatheredRows], Metadata]] = []
         self._changing = threading.Lock()
         self._dropped = 0
         self._trouble: str | None = None

@@ -77,9 +77,7 @@ def apply_plan(made: ApplyPlan, *, commissioning: bool = False, report: Report |
 
 
 def _apply(made: ApplyPlan, stops: int, *, commissioning: bool, report: Report | None) -> Applied:
-    """Write a plan's parameters; cancel the remaining writes once the drive was stopped more than `stops`
-    times.
-    """
+    """Write a plan's parameters until the drive is stopped more than `stops` times."""
     drive = made.drive
     journal = _Journal(drive)
     result = Applied(made, earlier=journal.earlier())

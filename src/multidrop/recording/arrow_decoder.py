@@ -1,28 +1,127 @@
-"""Decode the batches of an Arrow IPC stream into rows with texts in place of dictionary codes.
+"""Parse the messages of an Arrow IPC stream, and decode its batches into rows with texts in place of codes.
 
-All numbers in the batches are checked: a damaged batch raises an error.
+All numbers in the file are checked: a damaged file raises an error and causes no crash. Field numbers are
+those of Arrow's format/Message.fbs and format/Schema.fbs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import struct
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from itertools import islice, pairwise
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 from multidrop.core import Names, spell
 from multidrop.core.columns import greatest_code, wide_codes, widen
 from multidrop.polling.batch import assemble
-from multidrop.recording.arrow_ipc import (
+from multidrop.recording.arrow_encoder import (
+    CONTINUATION,
     DICTIONARY_BATCH,
     FLOAT,
+    PREFIX,
     RECORD_BATCH,
     SINGLE,
     UTF8,
     FileColumn,
-    FlatTable,
-    IpcMessage,
 )
 from multidrop.recording.rows import RecordedRows
+
+# ---- messages ----
+
+
+class FlatTable:
+    """A flatbuffer's table. Fields are read by number; an absent field is 0 or empty."""
+
+    def __init__(self, data: bytes, at: int) -> None:
+        self._data = data
+        self._at = at
+        self._vtable = at - self._read("<i", at)
+
+    def number(self, field: int, format: str) -> int:
+        at = self._find(field)
+        return self._read(format, at) if at else 0
+
+    def table(self, field: int) -> FlatTable | None:
+        at = self._find(field)
+        return FlatTable(self._data, at + self._read("<I", at)) if at else None
+
+    def tables(self, field: int) -> list[FlatTable]:
+        start, count = self._vector(field, 4)
+        return [FlatTable(self._data, at + self._read("<I", at)) for at in range(start, start + 4 * count, 4)]
+
+    def pairs(self, field: int) -> list[tuple[int, int]]:
+        """Return the field's vector of structs of two int64 each."""
+        start, count = self._vector(field, 16)
+        return list(struct.iter_unpack("<qq", self._data[start : start + 16 * count]))
+
+    def text(self, field: int) -> bytes:
+        start, count = self._vector(field, 1)
+        return self._data[start : start + count]
+
+    def _find(self, field: int) -> int:
+        slot = 4 + 2 * field
+        if slot >= self._read("<H", self._vtable):
+            return 0
+        offset = self._read("<H", self._vtable + slot)
+        return self._at + offset if offset else 0
+
+    def _vector(self, field: int, size: int) -> tuple[int, int]:
+        at = self._find(field)
+        if not at:
+            return 0, 0
+        start = at + self._read("<I", at)
+        count = self._read("<I", start)
+        if start + 4 + count * size > len(self._data):
+            raise struct.error("a vector ends outside of the message")
+        return start + 4, count
+
+    def _read(self, format: str, at: int) -> int:
+        number: int = struct.unpack_from(format, self._data, at)[0]
+        return number
+
+
+@dataclass(frozen=True)
+class IpcMessage:
+    """One complete message: its header, and the positions in the file where its body starts and ends."""
+
+    kind: int
+    header: FlatTable | None
+    body: int
+    end: int
+
+
+def messages(file: BinaryIO, size: int, start: int = 0) -> Iterator[IpcMessage]:
+    """Yield the messages between the positions `start` and `size`; stop at a truncated or invalid message."""
+    end = start
+    while message := _message(file, end, size):
+        yield message
+        end = message.end
+
+
+def _message(file: BinaryIO, at: int, size: int) -> IpcMessage | None:
+    file.seek(at)
+    prefix = file.read(PREFIX.size)
+    if len(prefix) < PREFIX.size:
+        return None
+    marker, length = PREFIX.unpack(prefix)
+    body = at + PREFIX.size + length
+    if marker != CONTINUATION or length < 0 or body > size:
+        return None
+    if length == 0:  # the end marker of the stream
+        return IpcMessage(0, None, body, body)
+    try:
+        metadata = file.read(length)
+        message = FlatTable(metadata, struct.unpack_from("<I", metadata)[0])
+        end = body + message.number(3, "<q")
+        if not body <= end <= size:
+            return None
+        return IpcMessage(message.number(1, "<B"), message.table(2), body, end)
+    except struct.error:
+        return None
+
+
+# ---- batches ----
 
 # limit in bytes of one column's texts in one batch: a small damaged file could expand to gigabytes
 MOST_SPELLED = 1 << 28
@@ -46,7 +145,7 @@ class RecordedColumns(NamedTuple):
 
 
 class BatchDecoder:
-    """Decodes one file's batches in their order. A batch uses the dictionaries that precede it in the file.
+    """Decodes the batches of one file, in the file's order.
 
     `columns` lists the file's columns, each with the id of its dictionary or None.
     """
@@ -80,10 +179,10 @@ class BatchDecoder:
         return self._names
 
     def columns(self, header: FlatTable, body: memoryview, names_of: dict[int, Names]) -> RecordedColumns:
-        """Return a batch's columns, with checked codes in place of names.
+        """Return a batch's columns, with codes in place of names.
 
-        `names_of` are the dictionaries before this batch in the file. Raises the errors of `decode`, and
-        ValueError for files of earlier versions, whose names have no codes.
+        `names_of` are the dictionaries that precede this batch in the file. Raises the errors of `decode`,
+        and ValueError for files of earlier versions, whose names have no codes.
         """
         rows, buffers = _parts(header, body, sum(column.buffers for column, _ in self._columns))
         left = iter(buffers)
@@ -133,9 +232,7 @@ class BatchDecoder:
         return valid, *data
 
     def _learn(self, header: FlatTable, body: memoryview) -> None:
-        """Store the dictionary in this message. If the message is a delta, extend the stored dictionary
-        instead.
-        """
+        """Store the dictionary in this message; a delta extends the stored dictionary."""
         number, table = header.number(0, "<q"), header.table(1)
         if table is None or number not in self._ids:
             raise ValueError("it has a dictionary that no column uses")
@@ -155,11 +252,7 @@ class BatchDecoder:
 
 
 def _parts(batch: FlatTable, body: memoryview, count: int) -> tuple[int, list[bytes]]:
-    """Return the number of rows of a batch, and its buffers. There must be `count` buffers.
-
-    The buffers are copies. A memoryview of `body` that survives in an error's traceback would crash the
-    interpreter.
-    """
+    """Return the number of rows of a batch, and copies of its buffers. There must be `count` buffers."""
     if batch.table(3):
         raise ValueError("its batches are compressed: only pyarrow and polars can read them")
     rows, places = batch.number(0, "<q"), batch.pairs(2)
@@ -167,6 +260,7 @@ def _parts(batch: FlatTable, body: memoryview, count: int) -> tuple[int, list[by
         raise ValueError(f"a batch states {rows} rows, but has only {len(body)} bytes")
     if len(places) != count:
         raise ValueError(f"a batch has {len(places)} buffers, not {count}")
+    # copies, because a view of `body` that survives in an error's traceback would crash the interpreter
     return rows, [bytes(body[at : at + length]) for at, length in places]
 
 

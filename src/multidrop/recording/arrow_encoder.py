@@ -1,33 +1,75 @@
-"""Encode rows as record batches of an Arrow IPC stream, with names as dictionaries.
+"""Encode rows as messages of an Arrow IPC stream, with names as dictionaries.
 
 A dictionary precedes the first batch that needs it. A changed dictionary is written again as a whole, because
 polars and nanoarrow cannot read deltas. A dictionary and its batch are appended to the file in one write.
+Field numbers are those of Arrow's format/Message.fbs and format/Schema.fbs.
 """
 
 from __future__ import annotations
 
+import struct
+import sys
 from array import array
+from collections import deque
 from collections.abc import Iterator, Sequence
 from itertools import accumulate
-from struct import pack
 from typing import Any, NamedTuple
 
 from multidrop.core import STATUSES
 from multidrop.core.columns import MOST_NARROW, CodeTable, narrow_up
 from multidrop.polling.batch import Batch, Rows
-from multidrop.recording.arrow_ipc import (
-    CODED,
-    CONTINUATION,
-    DICTIONARY_BATCH,
-    PREFIX,
-    RECORD_BATCH,
-    SCHEMA,
-    Structs,
-    Table,
-    build,
-    schema_table,
-)
 from multidrop.recording.rows import texts_of
+
+PREFIX = struct.Struct("<4si")  # the continuation marker, then the length of the metadata
+CONTINUATION = b"\xff\xff\xff\xff"
+SCHEMA, DICTIONARY_BATCH, RECORD_BATCH = 1, 2, 3  # header_type of a message
+
+# ---- columns of a file ----
+
+INT, FLOAT, UTF8, TIMESTAMP = 2, 3, 5, 10  # Field.type_type
+SINGLE, DOUBLE, NANOSECONDS = 1, 2, 3
+BUFFERS = {INT: 2, FLOAT: 2, TIMESTAMP: 2, UTF8: 3}  # number of buffers of a column in a batch, by type
+
+
+class FileColumn(NamedTuple):
+    """A column of a file.
+
+    `detail` is the first field of its Arrow type: the number of bits, the precision or the time unit.
+    """
+
+    name: bytes
+    kind: int
+    detail: int = 0
+    code_bits: int = 0  # width of the unsigned dictionary codes in bits; 0: no dictionary
+    nullable: bool = False
+
+    @property
+    def buffers(self) -> int:
+        """Number of the column's buffers in a batch: two for codes or numbers, three for texts."""
+        return 2 if self.code_bits else BUFFERS[self.kind]
+
+
+COLUMNS = (
+    FileColumn(b"time", TIMESTAMP, NANOSECONDS),
+    FileColumn(b"monotonic_ns", INT, 64),
+    FileColumn(b"uncertainty_ns", FLOAT, SINGLE, nullable=True),  # rounded up, so it stays an upper bound
+    FileColumn(b"drive", UTF8, code_bits=16),
+    FileColumn(b"register", UTF8, code_bits=16),
+    FileColumn(b"value", FLOAT, DOUBLE, nullable=True),
+    FileColumn(b"status", UTF8, code_bits=8),
+)
+# columns in files of versions up to 0.1, and in files that other programs write
+COLUMNS_BEFORE = (
+    *COLUMNS[:2],
+    FileColumn(b"uncertainty_ns", INT, 64, nullable=True),
+    *(FileColumn(name, UTF8) for name in (b"drive", b"register")),
+    COLUMNS[5],
+    FileColumn(b"status", UTF8),
+)
+CODED = {number: column for number, column in enumerate(COLUMNS) if column.code_bits}  # by dictionary id
+
+
+# ---- rows ----
 
 VERSION = ("<h", 4)  # version V5 of the Arrow format
 LONGEST_TEXTS = (1 << 31) - 1  # limit in bytes for a dictionary's texts
@@ -41,7 +83,7 @@ Codes = dict[int, tuple[Column, Names]]  # by dictionary id: the code of each ro
 
 def schema_message(metadata: dict[bytes, bytes]) -> bytes:
     """Return the first message of a file, with the schema and the metadata."""
-    return b"".join(_message(SCHEMA, schema_table(metadata), []))
+    return b"".join(_message(SCHEMA, _schema(metadata), []))
 
 
 class Encoder:
@@ -127,10 +169,7 @@ class _BatchCodes:
         self.certain = self.valid = columns.valid
 
     def codes(self, begin: int, end: int) -> Codes | None:
-        """Return codes for the drives, registers and statuses of the rows `begin` to `end`, and their names.
-
-        Return None if the rows have more names than there are codes.
-        """
+        """Return the rows' codes with the names that they stand for; None if there are too many names."""
         columns, rows = self._columns, slice(begin, end)
         statuses = self._statuses.narrow(columns.status[rows])
         if statuses is None:
@@ -158,10 +197,7 @@ class _RowCodes:
         self.certain, self.valid = (_bits(children[number]) for number in (2, 5))
 
     def codes(self, begin: int, end: int) -> Codes | None:
-        """Return codes for the drives, registers and statuses of the rows `begin` to `end`, and their names.
-
-        Return None if the rows have more names than there are codes.
-        """
+        """Return the rows' codes with the names that they stand for; None if there are too many names."""
         found: Codes = {}
         for number, texts in self._texts.items():
             known, part = self._known[number], texts[begin:end]
@@ -187,7 +223,7 @@ def _dictionary(number: int, names: Names) -> list[Any]:
     ends = list(accumulate(map(len, texts), initial=0))
     if ends[-1] > LONGEST_TEXTS:
         raise ValueError(f"a batch has {ends[-1]} bytes of names; at most {LONGEST_TEXTS} fit")
-    buffers = [b"", pack(f"={len(ends)}i", *ends), b"".join(texts)]
+    buffers = [b"", struct.pack(f"={len(ends)}i", *ends), b"".join(texts)]
     data, body = _record_batch(len(names), [0], buffers)
     return _message(DICTIONARY_BATCH, {0: ("<q", number), 1: data}, body)
 
@@ -203,7 +239,7 @@ def _zeros(bits: bytes, rows: int) -> int:
 
 
 def _record_batch(rows: int, nulls: Sequence[int], buffers: Sequence[Any]) -> tuple[Table, list[Any]]:
-    """Return the table of a batch, and its body: each buffer padded to a multiple of eight bytes."""
+    """Return the table of a batch, and its buffers, each padded to a multiple of eight bytes."""
     nodes = [number for count in nulls for number in (rows, count)]
     places: list[int] = []
     body: list[Any] = []
@@ -215,8 +251,8 @@ def _record_batch(rows: int, nulls: Sequence[int], buffers: Sequence[Any]) -> tu
         at += size + -size % 8
     table = {
         0: ("<q", rows),
-        1: Structs(pack(f"<{len(nodes)}q", *nodes)),
-        2: Structs(pack(f"<{len(places)}q", *places)),
+        1: Structs(struct.pack(f"<{len(nodes)}q", *nodes)),
+        2: Structs(struct.pack(f"<{len(places)}q", *places)),
     }
     return table, body
 
@@ -224,6 +260,107 @@ def _record_batch(rows: int, nulls: Sequence[int], buffers: Sequence[Any]) -> tu
 def _message(kind: int, header: Table, body: list[Any]) -> list[Any]:
     length = sum(memoryview(buffer).nbytes for buffer in body)
     table = {0: VERSION, 1: ("<B", kind), 2: header, 3: ("<q", length)}
-    metadata = build(table)
+    metadata = _build(table)
     metadata += bytes(-len(metadata) % 8)
     return [PREFIX.pack(CONTINUATION, len(metadata)), metadata, *body]
+
+
+def _schema(metadata: dict[bytes, bytes]) -> Table:
+    return {
+        0: ("<h", int(sys.byteorder == "big")),
+        1: [_field(number, column) for number, column in enumerate(COLUMNS)],
+        2: [{0: key, 1: value} for key, value in metadata.items()],
+    }
+
+
+def _field(number: int, column: FileColumn) -> Table:
+    field: Table = {
+        0: column.name,
+        1: ("<?", column.nullable),
+        2: ("<B", column.kind),
+        3: _type(column.kind, column.detail),
+        5: [],
+    }
+    if column.code_bits:
+        field[4] = {0: ("<q", number), 1: {0: ("<i", column.code_bits), 1: ("<?", False)}}
+    return field
+
+
+def _type(kind: int, detail: int) -> Table:
+    if kind == INT:
+        return {0: ("<i", detail), 1: ("<?", True)}
+    if kind == FLOAT:
+        return {0: ("<h", detail)}
+    return {0: ("<h", detail), 1: b"UTC"} if kind == TIMESTAMP else {}
+
+
+# ---- flatbuffers ----
+
+
+Table = dict[int, Any]
+_OFFSET = ("<I", 0)  # placeholder for an offset that `_build` fills in later
+
+
+class Structs(bytes):
+    """A vector of structs of 16 bytes each."""
+
+
+def _build(root: Table) -> bytes:
+    """Return the flatbuffer of this table."""
+    out = bytearray(4)
+    waiting: deque[tuple[int, Any]] = deque([(0, root)])  # (position of an offset, its target)
+    while waiting:
+        place, thing = waiting.popleft()
+        if isinstance(thing, dict):
+            at = _put_table(out, thing, waiting)
+        elif isinstance(thing, list):
+            at = _put_tables(out, thing, waiting)
+        else:
+            at = _put_vector(out, thing)
+        struct.pack_into("<I", out, place, at - place)
+    return bytes(out)
+
+
+def _align(out: bytearray, size: int, ahead: int = 0) -> None:
+    """Pad `out`, so that the position `ahead` bytes after its end is a multiple of `size`."""
+    out += bytes(-(len(out) + ahead) % size)
+
+
+def _put_table(out: bytearray, table: Table, waiting: deque[tuple[int, Any]]) -> int:
+    """Append the vtable and the table; return the table's position."""
+    # larger fields come first, so that all fields are aligned
+    fields = {number: value if isinstance(value, tuple) else _OFFSET for number, value in table.items()}
+    in_order = sorted(fields, key=lambda number: -struct.calcsize(fields[number][0]))
+    slots = [0] * (max(table, default=-1) + 1)
+    size = 4
+    for number in in_order:
+        width = struct.calcsize(fields[number][0])
+        size += -size % width
+        slots[number] = size
+        size += width
+    vtable = struct.pack(f"<{2 + len(slots)}H", 4 + 2 * len(slots), size, *slots)
+    _align(out, 8, len(vtable))
+    out += vtable
+    at = len(out)
+    out += struct.pack("<i", len(vtable)) + bytes(size - 4)
+    for number, value in table.items():
+        struct.pack_into(fields[number][0], out, at + slots[number], fields[number][1])
+        if not isinstance(value, tuple):
+            waiting.append((at + slots[number], value))
+    return at
+
+
+def _put_tables(out: bytearray, tables: list[Table], waiting: deque[tuple[int, Any]]) -> int:
+    _align(out, 4)
+    at = len(out)
+    out += struct.pack("<I", len(tables)) + bytes(4 * len(tables))
+    waiting.extend((at + 4 + 4 * number, table) for number, table in enumerate(tables))
+    return at
+
+
+def _put_vector(out: bytearray, data: bytes) -> int:
+    is_structs = isinstance(data, Structs)
+    _align(out, 8 if is_structs else 4, 4 if is_structs else 0)
+    at = len(out)
+    out += struct.pack("<I", len(data) // 16 if is_structs else len(data)) + data + b"\0"
+    return at

@@ -16,18 +16,16 @@ from typing import NamedTuple
 
 from multidrop.core import Names
 from multidrop.polling.batch import Rows
-from multidrop.recording.arrow_decoder import BatchDecoder, RecordedColumns
-from multidrop.recording.arrow_encoder import Encoder, schema_message
-from multidrop.recording.arrow_ipc import (
+from multidrop.recording.arrow_decoder import BatchDecoder, FlatTable, IpcMessage, RecordedColumns, messages
+from multidrop.recording.arrow_encoder import (
     COLUMNS,
     COLUMNS_BEFORE,
     DICTIONARY_BATCH,
     RECORD_BATCH,
     SCHEMA,
+    Encoder,
     FileColumn,
-    FlatTable,
-    IpcMessage,
-    messages,
+    schema_message,
 )
 from multidrop.recording.format import METADATA_KEY, AppendingWriter, Metadata, RecordingReader, dump_metadata
 
@@ -65,7 +63,7 @@ class ArrowsReader(RecordingReader):
             for message in messages(file, size):
                 if not self._whole:
                     self.metadata = self._read_schema(message)
-                # a last dictionary without its batch counts as truncated, because other libraries fail on it
+                # other libraries fail on a last dictionary without its batch, so it counts as truncated
                 elif message.kind == DICTIONARY_BATCH:
                     continue
                 self._whole = message.end
@@ -125,7 +123,7 @@ def _dictionary(field: FlatTable) -> int | None:
 
 
 def _described(*found: FileColumn) -> tuple[FileColumn, ...] | None:
-    """Return COLUMNS or COLUMNS_BEFORE if the file has exactly these columns, otherwise None."""
+    """Return COLUMNS or COLUMNS_BEFORE if these are the file's columns, else None."""
     for known in (COLUMNS, COLUMNS_BEFORE):
         if found == tuple(column._replace(nullable=False) for column in known):
             return known
@@ -136,14 +134,14 @@ writer, reader = ArrowsWriter, ArrowsReader
 
 
 class BatchPlace(NamedTuple):
-    """A batch's position in the file, and the dictionaries that its codes refer to."""
+    """The position of a batch in its file, and the dictionaries of its codes."""
 
     message: IpcMessage
     names: dict[int, Names]
 
 
 class RecordedBatch(NamedTuple):
-    """A batch's columns, and its position in the file."""
+    """The columns of a batch, and its position in the file."""
 
     columns: RecordedColumns
     place: BatchPlace
@@ -183,7 +181,7 @@ class ArrowsTail:
                 return
             body = self._body(message)
             try:
-                # a dictionary counts as read only with its batch: a failed write removes both
+                # a dictionary counts as read only with its batch, because a failed write removes both
                 if message.kind != RECORD_BATCH:
                     self._decoder.decode(message, message.header, body)
                     continue

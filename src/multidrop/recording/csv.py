@@ -123,9 +123,7 @@ def lines_of(rows: Rows) -> bytes:
 
 
 def lines_with_units(rows: Rows, units: Mapping[tuple[str, str], str]) -> bytes:
-    """Return the rows as lines of a .csv file whose last column is `unit`. `units` maps (drive, register) to
-    a unit.
-    """
+    """Return the rows as lines of a .csv file with a column `unit`; `units` maps (drive, register) to it."""
     return "".join(
         f"{_line(row)[:-1]},{_quote(units.get((row.drive, row.register), ''))}\n" for row in rows
     ).encode()
@@ -141,16 +139,14 @@ def _line(row: Row) -> str:
 
 @lru_cache(maxsize=4096)
 def _quote(text: str) -> str:
-    """Quote a text with a comma, a quote or a line end (RFC 4180); put an apostrophe before a possible
-    formula.
-    """
+    """Quote a text as RFC 4180 requires, with an apostrophe before a possible formula."""
     text = spreadsheet_text(text)
     return '"' + text.replace('"', '""') + '"' if set(text) & set(',"\r\n') else text
 
 
 @lru_cache(maxsize=4096)
 def _unquote(cell: str) -> str:
-    """Undo `_quote`: return the original text."""
+    """Return the original text of a cell that `_quote` made."""
     return cell[1:] if ESCAPED.match(cell) else cell
 
 

@@ -20,8 +20,9 @@ METADATA_KEY = "multidrop"  # key in an Arrow schema's metadata
 
 
 class RecordingError(OSError):
-    """A recording cannot be written: the disk is full or read-only, or a library is missing. `rows` is the
-    number of readable rows, written before the error.
+    """A recording cannot be written: the disk is full or read-only, or a library is missing.
+
+    `rows` is the number of readable rows that were written before the error.
     """
 
     def __init__(self, path: Path, reason: str, rows: int = 0) -> None:
@@ -34,7 +35,7 @@ class RecordingError(OSError):
 
 @contextmanager
 def writing(path: Path, rows: int = 0) -> Iterator[None]:
-    """Convert an OSError in the `with` block to a RecordingError with `rows`, the number of readable rows."""
+    """Convert an OSError of the `with` block to a RecordingError with this number of readable rows."""
     try:
         yield
     except RecordingExists:
@@ -95,7 +96,7 @@ class AppendingWriter(RecordingWriter):
             self._file.close()
 
 
-_REASONS = {  # for each exception of a library: the message for the user
+_REASONS = {  # by exception of a library: what is wrong with the file
     UnicodeDecodeError: "its text is not UTF-8",
     struct.error: "the stated lengths do not match the data",
     RuntimeError: "the stated lengths do not match the data",  # from nanoarrow
@@ -197,11 +198,9 @@ def already_there(path: Path) -> RecordingExists:
 
 
 def new_file(path: Path) -> FileIO:
-    """Create and open a file.
+    """Create and open a file; open an existing device or pipe.
 
-    Raises RecordingExists if the file exists, because it may hold months of data.
-
-    An existing device or pipe is opened, since opening it cannot lose data. Raises OSError.
+    Raises RecordingExists if the path is an existing file, which may hold months of data, and OSError.
     """
     mode = "wb" if path.exists() and not path.is_file() else "xb"
     try:
@@ -211,9 +210,7 @@ def new_file(path: Path) -> FileIO:
 
 
 class AppendFile:
-    """A new file to append to. Raises RecordingExists if a file exists at the path. All methods raise
-    OSError.
-    """
+    """A new file to append to. Raises RecordingExists if a file exists at the path; methods raise OSError."""
 
     def __init__(self, path: Path) -> None:
         self._file = new_file(path)
@@ -221,8 +218,9 @@ class AppendFile:
         self._is_truncated = False  # True if the last piece was appended only in part
 
     def append(self, piece: bytes | memoryview) -> None:
-        """Append the whole piece. After an error or a signal handler's exception, truncate the file to its
-        former length. If that fails too, the next `append` truncates the file first.
+        """Append the whole piece, or none of it.
+
+        After an error, the file is truncated to its former length, at the latest by the next `append`.
         """
         if self._is_truncated:
             self._cut()

@@ -28,7 +28,7 @@ from multidrop.recording.rows import RecordedRows
 
 GROUP_ROWS = 1 << 17  # rows per group; a group is collected in memory
 TEXTS = ("drive", "register", "status")
-MOST_TEXT = 1 << 26  # limit in bytes of one column's texts in a group of rows
+MOST_TEXT = 1 << 26  # limit in bytes for the texts of one column in a group of rows
 MOST_OF_GROUP = 1 << 29  # limit in bytes of an uncompressed group of rows
 UNREADABLE = "it cannot be read, because a Parquet file is readable only once it is closed"
 ENCODING = {
@@ -134,9 +134,8 @@ class ParquetReader(RecordingReader):
             yield opened
 
     def _check_sizes(self, described: Any) -> None:
-        """Raise ValueError for a group of rows that is too large for the memory after decompression. The
-        sizes of single columns are not read, because pyarrow would abort the process if they are damaged.
-        """
+        """Raise ValueError if a group of rows would take too much memory once it is unpacked."""
+        # only a group's size is read: pyarrow aborts the process if the size of a column is damaged
         for number in range(described.num_row_groups):
             size = described.row_group(number).total_byte_size
             if size > MOST_OF_GROUP:

@@ -32,9 +32,7 @@ def phase_row(number: int, time_ns: int, monotonic_ns: int) -> RecordedRows:
 
 
 def phase_names(metadata: Mapping[str, Any]) -> dict[float, str]:
-    """Return the names of a recording's phases by number. Return {} if there are none or the metadata is
-    damaged.
-    """
+    """Return the names of a recording's phases by number; {} if the metadata has none or is damaged."""
     found: Any = metadata
     for key in ("drives", PHASE_DRIVE, "registers", PHASE, "values"):
         found = found.get(key) if isinstance(found, dict) else None
@@ -68,7 +66,7 @@ class PhaseColumn:
         return build(self.schema, len(rows), [None], children=[*columns, phases], move=False)
 
     def _note(self, times: memoryview, drives: Iterable[str], registers: Iterable[str], values: Any) -> None:
-        """Remember where phases start in these rows."""
+        """Store the time and name of each phase that starts in these rows."""
         for at, (drive, register) in enumerate(zip(drives, registers, strict=True)):
             if drive == PHASE_DRIVE and register == PHASE:
                 self._starts.append(times[at])

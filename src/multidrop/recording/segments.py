@@ -20,7 +20,7 @@ from multidrop.recording.arrows import ArrowsReader, ArrowsWriter
 from multidrop.recording.format import Metadata, RecordingWriter, writing
 from multidrop.transport import clock
 
-MOST_CUT = 1 << 24  # in bytes; a longer unreadable end of a file is kept, not cut off
+MOST_CUT = 1 << 24  # limit in bytes of an unreadable end that is removed from a file
 
 
 def segments_of(path: Path, suffix: str = ".arrows") -> list[tuple[int, Path]]:
@@ -75,9 +75,7 @@ class SegmentWriter(RecordingWriter):
 
     @property
     def open_number(self) -> int:
-        """The number of the open segment; if none is open, that of the next. Segments with lower numbers are
-        closed.
-        """
+        """Number of the open segment, or else of the next one. Segments with lower numbers are closed."""
         return self.number if self._segment else self.number + 1
 
     def write(self, batch: Rows) -> None:
@@ -154,8 +152,7 @@ class StoredFile(NamedTuple):
 def outlived(
     files: Iterable[StoredFile], now: float, keep: float | None, most: int | None
 ) -> list[StoredFile]:
-    """Return the files to remove: those older than `keep` s, then the oldest until at most `most` bytes are
-    left.
+    """Return the files to remove: those older than `keep` s, and the oldest of more than `most` bytes.
 
     `now` is in s since 1970. None for `keep` or `most` means unlimited. A file with a lower number is older,
     even if the clock was set back.
@@ -177,9 +174,7 @@ def outlived(
 
 
 def _ages(files: Iterable[StoredFile], now: float, longest: float) -> dict[int, float]:
-    """Return each file's age in s by number. Gaps between files are not counted if negative or longer than
-    `longest`.
-    """
+    """Return each file's age in s by number, without gaps between files that are longer than `longest`."""
     ends: dict[int, float] = {}
     for file in files:
         # If a segment is in two files, use the earlier end, because a copy may have a later time.

@@ -21,7 +21,7 @@ LONGEST_NAME = 4096  # limit of a name's length in bytes
 LARGEST_COUNT = 2**53  # largest count that a float64 holds exactly
 LATEST_NS = 230 * 365 * 86400 * 10**9  # ns UTC; libraries cannot convert later times to dates
 RAW = "raw count"  # unit of values without a known scale
-PIECE_ROWS = 1 << 18  # rows that an export collects in memory
+PIECE_ROWS = 1 << 18  # number of rows that an export collects in memory
 MOST_CODES = 1 << 16  # largest number of different drives, of different registers, and of different statuses
 Array = NDArray[Any]
 
@@ -60,8 +60,9 @@ def numbers_of(column: Any) -> Array:
 
 
 def rows_by_series(drive: Array, register: Array, time: Array) -> list[Array]:
-    """Return the row indexes of each series (a drive's register), in the order of time. `drive` and
-    `register` are codes. There must be at least one row.
+    """Return the row indexes of each series (a drive's register), in the order of time.
+
+    `drive` and `register` are the codes of at least one row.
     """
     pair = drive.astype(np.int64) * (int(register.max()) + 1) + register
     order = np.lexsort((time, pair))
@@ -98,9 +99,7 @@ def _is_count(count: object) -> bool:
 
 
 def unit_of_register(about: Mapping[str, Any]) -> str:
-    """Return the unit of a register with this metadata: "raw count" if the scale is unknown, "" for named
-    states.
-    """
+    """Return the unit in a register's metadata: "raw count" without a known scale, "" for named values."""
     if about.get("values"):
         return ""
     if "step" in about and about["step"] is None:
@@ -184,15 +183,11 @@ class SeriesWriter(RecordingWriter):
                 self._in_thread(self._write_piece)
 
     def _in_thread(self, work: Callable[[], Any]) -> None:
-        """Do this work in the library's thread and wait for it. The work is completed even if Ctrl-C
-        interrupts the wait.
-        """
+        """Do this work in the library's thread. Ctrl-C interrupts only the wait, not the work."""
         self._thread.submit(work).result()
 
     def _open(self, work: Callable[[], Any]) -> None:
-        """Do this work, which creates the file, in the library's thread. Remove the file if the work fails or
-        is interrupted.
-        """
+        """Create the file by this work in the library's thread; remove the file if that fails."""
         try:
             self._in_thread(work)
         except BaseException:

@@ -82,8 +82,7 @@ class TriggeredWriter(RecordingWriter):
         """Record a batch from a poller."""
         assert isinstance(batch, Batch)
         kept = copied(batch)
-        # Find the newest time without events, because rows that are older than an event may still come after
-        # it.
+        # events do not count, because rows that are older than an event may still come after it
         columns = kept.columns()
         times = zip(columns.drive, columns.monotonic_ns, strict=True)
         newest_ns = max((ns for drive, ns in times if columns.drives[drive] != EVENT), default=0)

@@ -43,8 +43,9 @@ def _lines(plan: RunPlan) -> list[_LineTime]:
 
 
 def longest_pause(plan: RunPlan) -> float:
-    """Return the longest planned time in s between two values of a drive that the test uses. A compared
-    register or a fault code counts separately.
+    """Return the longest planned time in s between two values of a drive that the test uses.
+
+    Each compared register and each fault code counts separately.
     """
     compared = {*plan.faults, *((condition.drive, condition.register) for condition in plan.conditions)}
     pauses = [one.prediction.cycle for one in _lines(plan)]
@@ -63,9 +64,7 @@ def silence_of(plan: RunPlan) -> float:
 
 
 def misfits(plan: RunPlan) -> list[str]:
-    """Return a sentence for each part of the test that is too fast for its line. The sentence has a value
-    that would fit.
-    """
+    """Return a sentence for each part of the test that is too fast for its line, with a value that fits."""
     found = list(dict.fromkeys(_misfits(plan)))
     least = CYCLES * longest_pause(plan)
     if silence_of(plan) < least:

@@ -129,9 +129,7 @@ def _phase(table: Any, place: TomlPlace, plant: Plant) -> list[RunStep]:
 
 
 def _steps(table: Any, place: TomlPlace, plant: Plant) -> Iterator[RunStep]:
-    """Yield the step that a table describes. If the table lists several frequencies, yield a step for
-    each.
-    """
+    """Yield the step that a table describes, or a step for each of several listed frequencies."""
     errors = len(place.config_errors)
     given = place.check(table, _STEP)
     for key in ("frequency", "write"):
@@ -192,9 +190,7 @@ def _rate(given: Mapping[str, Any], place: TomlPlace) -> float | None:
 
 
 def _check_keys(given: Mapping[str, Any], step: RunStep, place: TomlPlace) -> None:
-    """Add an error for each key that needs another key. If there is none, add an error if the step does
-    nothing.
-    """
+    """Report keys that need another key; else report a step that does nothing."""
     lacking = [(key, needs) for key, needs in NEEDS.items() if given.get(key) and not given.get(needs)]
     for key, needs in lacking:
         place.wrong(f"{key} needs {needs}; add {_STEP[needs].example}", key)
@@ -203,9 +199,7 @@ def _check_keys(given: Mapping[str, Any], step: RunStep, place: TomlPlace) -> No
 
 
 def _each(frequency: Mapping[str, Any], place: TomlPlace) -> Iterator[dict[str, float]]:
-    """Yield the drives' frequencies for each step. In `frequency`, a drive has a list with a number for each
-    step, or a single number for all steps.
-    """
+    """Yield the drives' frequencies for each step, from lists and from single numbers for all steps."""
     lists = {name: one if isinstance(one, list) else [one] for name, one in frequency.items()}
     for name, numbers in lists.items():
         for hz in numbers:

@@ -28,9 +28,7 @@ EXAMPLE = "pump-1.output_current > 30"
 
 
 def polled_drive(plant: Plant, name: str) -> PolledDrive:
-    """Return the polled drive of this name. If there is none, raise ValueError with the most similar
-    names.
-    """
+    """Return the polled drive of this name. Raises ValueError with similar names if there is none."""
     line, drive = plant.find_drive(name)
     return next(polled for polled in line.drives if polled.drive is drive)
 
@@ -168,9 +166,10 @@ class RunPlan:
 
 @dataclass(frozen=True)
 class PlannedStep:
-    """A step with its planned start in s after the run's start. Its length in s does not include the wait for
-    `until`. `is_latest` is True if `begin` is only the latest possible start, because an earlier step waits
-    for a condition.
+    """A step with its planned start, in s after the run's start, and its length in s.
+
+    The length does not include the wait for `until`. `is_latest` is True if the step may start earlier than
+    at `begin`, because an earlier step waits for a condition.
     """
 
     step: RunStep

@@ -17,8 +17,9 @@ from multidrop.runs.model import RunStep
 
 
 def contradictions(step: RunStep, frequency: Collection[str]) -> Iterator[tuple[str, str]]:
-    """For each command that contradicts another command to the same drive, yield the command's key and a
-    sentence. `frequency` has the names of the drives whose frequency the step sets.
+    """Yield key and error sentence of each command that contradicts another one to the same drive.
+
+    `frequency` has the names of the drives whose frequency the step sets.
     """
     for name in dict.fromkeys(step.stop):
         if name in (*frequency, *step.write, *step.start):
@@ -45,8 +46,9 @@ def check_step(step: RunStep, plant: Plant) -> None:
 
 
 def _rehearse(script: Any, *arguments: Any) -> Any:
-    """Return the first step of a command's script, such as that of `start`, without carrying it out. Raises
-    ValueError if the family lacks or forbids the command.
+    """Return the first step of a verb's script; nothing is sent.
+
+    Raises ValueError if the family lacks or forbids the verb.
     """
     try:
         return next(script(*arguments))

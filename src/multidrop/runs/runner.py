@@ -36,22 +36,23 @@ from multidrop.runs.watch import LimitWatch
 from multidrop.transport import clock
 from multidrop.transport.port_identity import is_simulated
 
-LOOK_S = 0.01  # pause between two comparisons of new rows with the limits, in s
-STILL_S = 5.0  # a run ends if it does not compare rows with its limits for longer than this, in s
-LATE_S = 0.5  # s; a greater delay of a step also delays all later steps, so that no step gets shorter
-UNKNOWN = "the stops of its line failed; the log has the error"
+LOOK_S = 0.01  # pause in s between two comparisons of new rows with the limits
+STILL_S = 5.0  # a run is aborted if it compares no rows with its limits for this many seconds
+LATE_S = 0.5  # s; if a step ends later than this, all later steps are delayed, and none gets shorter
+UNKNOWN = "its line's stops failed; the log has the error"
 SHORTEST_S = 1e-4  # shortest period of a polled register, in s
 MOST_WAITING = 3000  # limit of batches (30 s or more) that wait for the recording or for a callback
-# On a busy computer, a simulated drive may reply later than a real drive's time-out.
-SIMULATED_ATTEMPTS = 20  # most attempts to check or command a simulated drive
-SIMULATED_SILENCE_S = 60.0  # the least default of `silence` if all lines are simulated
-ENDING_S = 10.0  # how long the end of a run waits for the recording and for each taker, in s
+# On a busy computer, a simulated drive may reply after the timeout.
+SIMULATED_ATTEMPTS = 20  # limit of attempts to check or command a simulated drive
+SIMULATED_SILENCE_S = 60.0  # the smallest default of `silence` if all lines are simulated
+ENDING_S = 10.0  # time in s that the end of a run waits for the recording and for each callback
 
 
 @dataclass(frozen=True)
 class RunResult:
-    """The result of a run: why it was aborted ("" if it was not), and the result of each drive's stop, by
-    drive name.
+    """The result of a run.
+
+    `abort` is the reason why the run was aborted, or "". `stopped` has the result of each drive's stop.
     """
 
     abort: str
@@ -99,9 +100,7 @@ class TestRun:
         self._phases = [*dict.fromkeys([*(step.name for step in self.plan.steps), STOP])]
 
     def misfits(self) -> list[str]:
-        """Return a sentence for each part of the test that is too fast for its line, with values that
-        would fit.
-        """
+        """Return a sentence for each part of the test that is too fast for its line, with a fitting value."""
         return misfits(self.plan)
 
     @property
@@ -295,7 +294,7 @@ class _Session:
         for number, planned in enumerate(self._run.timeline):
             step = planned.step
             self._run.number = number
-            self._check_standstill()  # no start may be sent after a suspension of the process
+            self._check_standstill()  # if the process was suspended, no further drive may be started
             self._mark(step.name)
             works = [
                 pool.submit(copy_context().run, self._command, self._poller[name], step)
@@ -304,11 +303,10 @@ class _Session:
             at = self._follow(works, at + planned.seconds, step)
 
     def _follow(self, works: list[Future[Any]], over: float = 0.0, step: RunStep | None = None) -> float:
-        """Wait for three things: the end of the commands `works`, the time `over` in s since the run's start,
-        and the step's condition.
+        """Wait for the commands `works`, for the planned end `over`, and for the step's condition.
 
-        Return the time when the next step is due, in s since the run's start. Raises _Aborted at a limit, and
-        if a command fails.
+        Return when the next step is due. Both times are in s since the run's start. Raises _Aborted at a
+        limit, and if a command fails.
         """
         since_ns, is_late = clock.now_ns(), False
         until = step.until if step else None
@@ -329,17 +327,17 @@ class _Session:
             clock.sleep(min(pause, over - now) if over > now else pause)
 
     def _look(self, works: list[Future[Any]]) -> None:
-        """Take one batch of rows. Raises _Aborted if a limit is reached, if a command has failed, or if
-        rows were lost. Raises the error of the recording or of a callback.
+        """Take one batch of rows, and check limits, commands and callbacks.
 
-        While the computer sleeps, no values come. That time counts too, so that a run does not continue after
-        a sleep.
+        Raises _Aborted if a limit is reached, if a command has failed, or if rows were lost. Raises the error
+        of the recording or of a callback.
         """
         self._check_standstill()
         self.take()
         self._raise_failure()
         if slow := next((thread for thread in self._row_threads if thread.has_lost), None):
             raise _Aborted(f"more than {MOST_WAITING} batches waited for {slow.name}")
+        # the time that the computer slept counts too, so that a run does not continue after a sleep
         if why := self._watch.silent(clock.boottime_ns() - self._slept_ns):
             raise _Aborted(why)
         duration = self._plan.limits.duration
@@ -353,9 +351,7 @@ class _Session:
                 raise failure
 
     def _check_standstill(self) -> None:
-        """Raise _Aborted if the run did not compare rows for too long, for example because its process was
-        suspended.
-        """
+        """Raise _Aborted if no rows were compared for too long, such as while the process was suspended."""
         before_ns, self._looked_ns = self._looked_ns, clock.boottime_ns()
         still_s = (self._looked_ns - before_ns) / 1e9
         if still_s > STILL_S:
@@ -395,7 +391,7 @@ class _Session:
         self._insist(drive, check, NoReply, BadReply, Expired)
 
     def _command(self, drive: Drive, step: RunStep) -> None:
-        """Command the drive as the step says. No start that may have been sent is sent again."""
+        """Carry out a step's commands to this drive. A start that may have been sent is not repeated."""
         self._insist(drive, lambda: _command(drive, step), Expired)
 
     def _insist(self, drive: Drive, work: Callable[[], object], *too_late: type[Exception]) -> object:
@@ -424,9 +420,7 @@ class _Session:
             self._mark(STOP)
 
     def _stop(self, pool: ThreadPoolExecutor) -> None:
-        """Stop all drives, and take rows until all stops have ended. Then wait until a signal that came
-        meanwhile has been handled.
-        """
+        """Stop all drives, and take rows until all stops have ended; then wait for a pending signal."""
         self._begin_stops()
         stops = [pool.submit(copy_context().run, bus.part) for bus in self._poller.buses.values()]
         while not all(stop.done() for stop in stops):

@@ -59,9 +59,8 @@ class LimitWatch:
         return register.format(register.decode(row.value) if register.values is not None else row.value)
 
     def _is_new_fault(self, drive: str, register: str, value: float) -> bool:
-        """Return True if `register` is a fault record that now has another fault. A record's first value does
-        not count, because its fault may be old.
-        """
+        """Return True if the value shows a new fault in a fault record, such as `last_fault`."""
+        # the first value of a record does not count, because its fault may be old
         if register not in FAULT_RECORDS:
             return False
         before = self._records.get((drive, register), value)
@@ -84,8 +83,6 @@ class LimitWatch:
         return ""
 
     def holds(self, condition: ReadingCondition, since_ns: int) -> bool:
-        """Return True if the condition holds for the newest value, and that value was requested at `since_ns`
-        or later.
-        """
+        """Return True if the condition holds for the newest value, and this was requested since `since_ns`."""
         row = self._newest[condition.drive].get(condition.register)
         return row is not None and row.monotonic_ns >= since_ns and condition.holds(row.value or 0.0)

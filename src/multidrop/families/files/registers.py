@@ -417,8 +417,9 @@ class Declared:
     def _addresses(
         self, given: Mapping[str, Any], good: dict[str, Any], place: TomlPlace, read: ReadAddress
     ) -> tuple[int, str] | None:
-        """Return the register's address in requests and its table; None after a mistake. The address in
-        `ram_address` is converted in `good`.
+        """Return the register's address in requests and its table; None after a mistake.
+
+        The key `ram_address` of `good` is converted too.
         """
         if "at" not in given or ("table" in given and "table" not in good):
             good.pop("ram_address", None)
