@@ -83,6 +83,6 @@ class LimitWatch:
         return ""
 
     def holds(self, condition: ReadingCondition, since_ns: int) -> bool:
-        """Return True if the condition holds for the newest value, and this was requested since `since_ns`."""
+        """Return True if the condition holds for the newest value, requested at `since_ns` or later."""
         row = self._newest[condition.drive].get(condition.register)
         return row is not None and row.monotonic_ns >= since_ns and condition.holds(row.value or 0.0)
