@@ -20,6 +20,7 @@ from examples import examples
 from hypothesis import HealthCheck, settings
 from patient import await_turns, be_patient
 from peers import require_module
+from simulated_bus import real_clock
 
 from multidrop.cli import main
 
@@ -203,6 +204,13 @@ def _own_state(_states: Iterator[Path]) -> None:
     state = next(_states)
     state.mkdir()
     os.environ["XDG_STATE_HOME"] = str(state)
+
+
+@pytest.fixture(autouse=True)
+def _real_clock() -> Iterator[None]:
+    """Restore the clock after a test with a `SimulatedBus`."""
+    with real_clock():
+        yield
 
 
 @pytest.fixture

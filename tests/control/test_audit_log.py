@@ -22,10 +22,8 @@ from multidrop.families.invt_che import CHEControl
 from multidrop.transport.aside_log import flush
 
 
-def test_a_refused_raw_request_is_recorded_as_refused(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    line, drive, _ = one(monkeypatch, InvtCHE(1), audit=tmp_path / "audit")
+def test_a_refused_raw_request_is_recorded_as_refused(tmp_path: Path) -> None:
+    line, drive, _ = one(InvtCHE(1), audit=tmp_path / "audit")
     refusal = build_reply(Framing.RTU, Message(1, 6, exception=0x12))
     line.answers = lambda request: refusal if request.function == 6 else None
     with pytest.raises(DriveException, match="code 12H"):
@@ -35,10 +33,8 @@ def test_a_refused_raw_request_is_recorded_as_refused(
 
 
 @pytest.mark.parametrize("is_lost", [False, True])
-def test_the_outcome_of_a_raw_request_is_recorded(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, is_lost: bool
-) -> None:
-    line, drive, _ = one(monkeypatch, YD1000(1), audit=tmp_path / "audit")
+def test_the_outcome_of_a_raw_request_is_recorded(tmp_path: Path, is_lost: bool) -> None:
+    line, drive, _ = one(YD1000(1), audit=tmp_path / "audit")
     line.loses = lambda request: is_lost
     with pytest.raises(Unconfirmed) if is_lost else nullcontext():
         drive.send_raw(6, 0x0000, b"\x00\x01")
@@ -48,9 +44,9 @@ def test_the_outcome_of_a_raw_request_is_recorded(
     assert entry["outcome"] == ("unconfirmed" if is_lost else "done")
 
 
-def test_the_audit_log_records_every_write(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_the_audit_log_records_every_write(tmp_path: Path) -> None:
     log = tmp_path / "audit.jsonl"
-    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50), audit=log)
+    line, drive, _ = one(InvtCHE(1, maximum_frequency=50), audit=log)
     drive.set_frequency(20)
     line.loses = lambda request: request.function == 6
     with pytest.raises(Unconfirmed):
@@ -66,10 +62,8 @@ def test_the_audit_log_records_every_write(monkeypatch: pytest.MonkeyPatch, tmp_
     assert (noted[1]["drive"], noted[1]["address"], noted[1]["port"]) == ("invt-che@1", 1, "hall")
 
 
-def test_a_stop_is_sent_even_if_the_audit_log_cannot_be_written(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    line, drive, _ = one(monkeypatch, InvtCHE(1), audit="/dev/full")
+def test_a_stop_is_sent_even_if_the_audit_log_cannot_be_written(caplog: pytest.LogCaptureFixture) -> None:
+    line, drive, _ = one(InvtCHE(1), audit="/dev/full")
     drive.stop()
     line.bus.close()
     flush(60)
@@ -110,7 +104,7 @@ def test_a_write_that_is_interrupted_or_fails_is_recorded(
 ) -> None:
     failure, function, act, what = ENDINGS[ending]
     log = tmp_path / "audit.jsonl"
-    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50), audit=log)
+    line, drive, _ = one(InvtCHE(1, maximum_frequency=50), audit=log)
     drive.set_frequency(20)
     before = len(line.written)
     carry_out = line.carry_out
@@ -137,10 +131,10 @@ Noted = list[tuple[str, str | None, str | None]]
 class Audited:
     """A bus with one CHE drive and an audit log, and a method that returns the log's records."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, path: Path) -> None:
+    def __init__(self, path: Path) -> None:
         self.path = path
         self.line: SimulatedBus
-        self.line, self.drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50), audit=path)
+        self.line, self.drive, _ = one(InvtCHE(1, maximum_frequency=50), audit=path)
         self.bus = self.line.bus
 
     def noted(self) -> Noted:
@@ -149,8 +143,8 @@ class Audited:
 
 
 @pytest.fixture
-def audited(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Audited]:
-    made = Audited(monkeypatch, tmp_path / "audit.jsonl")
+def audited(tmp_path: Path) -> Iterator[Audited]:
+    made = Audited(tmp_path / "audit.jsonl")
     with made.bus:
         yield made
 

@@ -42,10 +42,10 @@ BROADCASTING = [model for model, family in MODELS.items() if family.broadcasts]
 every_broadcasting = pytest.mark.parametrize("model", BROADCASTING)
 
 
-def line_of(monkeypatch: pytest.MonkeyPatch, *models: str) -> tuple[SimulatedBus, list[Any], list[Any]]:
+def line_of(*models: str) -> tuple[SimulatedBus, list[Any], list[Any]]:
     """Return a line with confirmed drives from address 1 on, and their simulations."""
     sims = [simulated(MAKE[model](address)) for address, model in enumerate(models, 1)]
-    line = SimulatedBus(monkeypatch, *sims)
+    line = SimulatedBus(*sims)
     drives = [line.attach(sim.drive) for sim in sims]
     for drive in drives:
         line.bus.check_identity(drive)
@@ -65,15 +65,15 @@ def test_all_families_but_the_erman_have_broadcasts() -> None:
 
 
 @every_broadcasting
-def test_stop_all_does_not_broadcast_if_families_differ(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
+def test_stop_all_does_not_broadcast_if_families_differ(model: str) -> None:
     """One family's stop may start a motor of the other family. Both orders of the drives are tested."""
     models = deque(MAKE)
     models.rotate(-models.index(model))
-    check_stopped_without_broadcast(monkeypatch, *models)
+    check_stopped_without_broadcast(*models)
 
 
-def check_stopped_without_broadcast(monkeypatch: pytest.MonkeyPatch, *models: str) -> None:
-    line, drives, sims = line_of(monkeypatch, *models)
+def check_stopped_without_broadcast(*models: str) -> None:
+    line, drives, sims = line_of(*models)
     for drive in drives:
         drive.set_frequency(20)
         drive.start()
@@ -83,27 +83,21 @@ def check_stopped_without_broadcast(monkeypatch: pytest.MonkeyPatch, *models: st
 
 
 @every_broadcasting
-def test_stop_all_broadcasts_if_all_drives_are_of_one_family(
-    monkeypatch: pytest.MonkeyPatch, model: str
-) -> None:
-    line, drives, _ = line_of(monkeypatch, model, model)
+def test_stop_all_broadcasts_if_all_drives_are_of_one_family(model: str) -> None:
+    line, drives, _ = line_of(model, model)
     line.bus.stop_all()
     (sent,) = broadcasts(line)
     drives[0].write(drives[0].control, stop_of(drives[0]))
     assert (sent.start, sent.data) == (line.frames[-2][0].start, line.frames[-2][0].data)
 
 
-def test_stop_all_sends_no_broadcast_if_the_family_defines_no_broadcast(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    check_stopped_without_broadcast(monkeypatch, "erman-er-g-220", "erman-er-g-220")
+def test_stop_all_sends_no_broadcast_if_the_family_defines_no_broadcast() -> None:
+    check_stopped_without_broadcast("erman-er-g-220", "erman-er-g-220")
 
 
 @pytest.mark.parametrize("models", [("erman-er-g-220", "erman-er-g-220"), ("invt-che", "yd1000")])
-def test_stop_all_reports_failed_if_neither_broadcast_nor_stop_was_sent(
-    monkeypatch: pytest.MonkeyPatch, models: tuple[str, str]
-) -> None:
-    line, _, _ = line_of(monkeypatch, *models)
+def test_stop_all_reports_failed_if_neither_broadcast_nor_stop_was_sent(models: tuple[str, str]) -> None:
+    line, _, _ = line_of(*models)
 
     def lose(request: Message) -> bytes | None:
         raise PortLost("hall", "there is no such port")
@@ -129,11 +123,9 @@ class Quiet(Toy):
 
 
 @pytest.mark.parametrize("confirmed", [0, 1])
-def test_stop_all_broadcasts_no_command_that_is_not_a_stop(
-    monkeypatch: pytest.MonkeyPatch, confirmed: int
-) -> None:
+def test_stop_all_broadcasts_no_command_that_is_not_a_stop(confirmed: int) -> None:
     drives = [Quiet(address, confirmed=confirmed) for address in (1, 2)]
-    line = SimulatedBus(monkeypatch, *(simulated(drive) for drive in drives))
+    line = SimulatedBus(*(simulated(drive) for drive in drives))
     for drive in drives:
         line.bus.check_identity(line.attach(drive))
     line.bus.stop_all(seconds=1)
@@ -151,7 +143,7 @@ def test_stop_all_broadcasts_no_command_that_is_not_a_stop(
 def test_a_broadcast_waits_for_late_replies_unless_it_is_a_stop(
     monkeypatch: pytest.MonkeyPatch, model: str
 ) -> None:
-    line, drives, _ = line_of(monkeypatch, model, model)
+    line, drives, _ = line_of(model, model)
     register = drives[0].control
     insists: list[bool] = []
 
@@ -168,11 +160,11 @@ def test_a_broadcast_waits_for_late_replies_unless_it_is_a_stop(
 
 @pytest.mark.parametrize("is_sent", [False, True])
 def test_a_failed_broadcast_is_reported_as_sent_only_if_bytes_were_sent(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, is_sent: bool
+    tmp_path: Path, is_sent: bool
 ) -> None:
     audit = tmp_path / "audit"
     sims = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2)]
-    line = SimulatedBus(monkeypatch, *sims, audit=audit)
+    line = SimulatedBus(*sims, audit=audit)
     drives = [line.attach(sim.drive) for sim in sims]
     for drive in drives:
         line.bus.check_identity(drive)
@@ -192,13 +184,11 @@ def test_a_failed_broadcast_is_reported_as_sent_only_if_bytes_were_sent(
 
 
 @pytest.mark.parametrize("address", [1, 2])
-def test_a_broadcast_is_refused_if_one_drive_is_of_another_family(
-    monkeypatch: pytest.MonkeyPatch, address: int
-) -> None:
+def test_a_broadcast_is_refused_if_one_drive_is_of_another_family(address: int) -> None:
     """At the address of a CHE's control word, a Goodrive has its setpoint."""
     sims = [simulated(InvtCHE(at, maximum_frequency=50)) for at in (1, 2)]
     sims[address - 1]["device"] = 0x010A
-    line = SimulatedBus(monkeypatch, *sims)
+    line = SimulatedBus(*sims)
     drives = [line.attach(sim.drive) for sim in sims]
     with pytest.raises(WriteForbidden, match="010AH"):
         line.bus.broadcast(drives[0].control, stop_of(drives[0]))
@@ -207,10 +197,8 @@ def test_a_broadcast_is_refused_if_one_drive_is_of_another_family(
 
 @every_broadcasting
 @pytest.mark.parametrize("frames", every_third(range(1, 12)))
-def test_a_start_called_before_a_broadcast_stop_is_not_sent_after_it(
-    monkeypatch: pytest.MonkeyPatch, model: str, frames: int
-) -> None:
-    line, drives, _ = line_of(monkeypatch, model, model)
+def test_a_start_called_before_a_broadcast_stop_is_not_sent_after_it(model: str, frames: int) -> None:
+    line, drives, _ = line_of(model, model)
     drives[0].set_frequency(20)
     begun = len(line.frames)
 
@@ -237,10 +225,8 @@ def setpoint_of(drive: Any) -> Any:
 
 
 @table("model", SETTING)
-def test_after_leave_stops_are_broadcast_but_setpoints_are_refused(
-    monkeypatch: pytest.MonkeyPatch, model: str
-) -> None:
-    line, drives, _ = line_of(monkeypatch, model, model)
+def test_after_leave_stops_are_broadcast_but_setpoints_are_refused(model: str) -> None:
+    line, drives, _ = line_of(model, model)
     assert 0 in setpoint_of(drives[0]).broadcast
     line.bus.leave()
     with pytest.raises(CancelledByStop, match="the bus was left"):
@@ -254,7 +240,7 @@ def test_after_leave_stops_are_broadcast_but_setpoints_are_refused(
 def test_a_setpoint_broadcast_is_cancelled_by_a_later_stop(
     monkeypatch: pytest.MonkeyPatch, moment: str
 ) -> None:
-    line, drives, _ = line_of(monkeypatch, "invt-che", "invt-che")
+    line, drives, _ = line_of("invt-che", "invt-che")
     line.sleep(60)  # after such a silence, the bus checks the identities again
     carry_out, begun = line.carry_out, len(line.frames)
 
@@ -271,11 +257,11 @@ def test_a_setpoint_broadcast_is_cancelled_by_a_later_stop(
     assert line.written == []
 
 
-def test_an_expired_setpoint_is_not_broadcast(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_an_expired_setpoint_is_not_broadcast(tmp_path: Path) -> None:
     """The audit log must not record the write as possibly sent."""
     audit = tmp_path / "audit"
     sims = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2)]
-    line = SimulatedBus(monkeypatch, *sims, audit=audit)
+    line = SimulatedBus(*sims, audit=audit)
     drives = [line.attach(sim.drive) for sim in sims]
     with written_before(lambda: 0.0), pytest.raises(Expired):
         line.bus.broadcast(drives[0].setpoint, 0.0)
@@ -287,20 +273,18 @@ def test_an_expired_setpoint_is_not_broadcast(monkeypatch: pytest.MonkeyPatch, t
     assert audit.read_text(encoding="utf-8") == ""
 
 
-def test_identity_checks_of_many_drives_do_not_expire_a_broadcast(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_identity_checks_of_many_drives_do_not_expire_a_broadcast() -> None:
     """The checks of 20 drives take longer than the expiry of one write."""
-    line, drives, _ = line_of(monkeypatch, *["invt-che"] * 20)
+    line, drives, _ = line_of(*["invt-che"] * 20)
     line.sleep(60)
     line.queue_time = 0.1
     line.bus.broadcast(drives[0].setpoint, 0.0)
     assert len(broadcasts(line)) == 1
 
 
-def test_a_setpoint_is_not_broadcast_if_a_drive_may_have_been_replaced(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_setpoint_is_not_broadcast_if_a_drive_may_have_been_replaced() -> None:
     """After a long silence, the second drive is replaced by one of another family."""
-    line, drives, sims = line_of(monkeypatch, "invt-che", "invt-che")
+    line, drives, sims = line_of("invt-che", "invt-che")
     line.sleep(60)
     sims[1]["device"] = 0x010A
     with pytest.raises(WriteForbidden, match="010AH"):
@@ -308,9 +292,9 @@ def test_a_setpoint_is_not_broadcast_if_a_drive_may_have_been_replaced(
     assert line.written == []
 
 
-def test_a_stop_that_was_only_broadcast_is_reported_as_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_that_was_only_broadcast_is_reported_as_sent() -> None:
     """The port is lost after the broadcast, so no stop is sent to a single drive."""
-    line, _, _ = line_of(monkeypatch, "invt-che", "invt-che")
+    line, _, _ = line_of("invt-che", "invt-che")
 
     def lose(request: Message) -> bytes | None:
         if broadcasts(line) and request.address:
@@ -323,10 +307,8 @@ def test_a_stop_that_was_only_broadcast_is_reported_as_sent(monkeypatch: pytest.
         assert "sent 1 times, it was never confirmed" in told.why
 
 
-def test_notes_of_an_interrupted_stop_all_count_the_broadcast_stop(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    line, _, _ = line_of(monkeypatch, "invt-che", "invt-che")
+def test_notes_of_an_interrupted_stop_all_count_the_broadcast_stop() -> None:
+    line, _, _ = line_of("invt-che", "invt-che")
 
     def press(request: Message) -> bytes | None:
         if broadcasts(line) and request.address:
@@ -343,11 +325,9 @@ def test_notes_of_an_interrupted_stop_all_count_the_broadcast_stop(
 # ---- a stop of all drives ----
 
 
-def test_only_stops_and_zero_setpoints_are_broadcast_and_to_one_family_only(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_only_stops_and_zero_setpoints_are_broadcast_and_to_one_family_only() -> None:
     sims = [simulated(InvtCHE(1)), simulated(InvtCHE(2))]
-    line = SimulatedBus(monkeypatch, *sims)
+    line = SimulatedBus(*sims)
     first, _ = (line.attach(sim.drive) for sim in sims)
     for value in set(CHEControl) - {CHEControl.STOP}:
         with pytest.raises(WriteForbidden, match="no harmless broadcast"):
@@ -367,9 +347,9 @@ def test_only_stops_and_zero_setpoints_are_broadcast_and_to_one_family_only(
     assert len(line.written) == 1
 
 
-def test_a_drive_that_is_unreadable_after_a_broadcast_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_drive_that_is_unreadable_after_a_broadcast_is_reported() -> None:
     sims = [simulated(InvtCHE(1)), simulated(InvtCHE(2))]
-    line = SimulatedBus(monkeypatch, *sims)
+    line = SimulatedBus(*sims)
     for sim in sims:
         line.bus.check_identity(line.attach(sim.drive))
     line.deafens = lambda request: request.address == 2
@@ -384,7 +364,7 @@ def test_a_drive_that_is_unreadable_after_a_broadcast_is_reported(monkeypatch: p
 
 def test_a_broadcast_is_followed_by_the_turnaround_delay(monkeypatch: pytest.MonkeyPatch) -> None:
     """The delay is at least 100 ms (serial-line guide V1.02, 2.4.1)."""
-    line, _, _ = one(monkeypatch, InvtCHE(1))
+    line, _, _ = one(InvtCHE(1))
     made: list[Exchange] = []
 
     def keep(exchange: Exchange, **times: Any) -> Completion:
@@ -404,8 +384,8 @@ def test_a_broadcast_is_followed_by_the_turnaround_delay(monkeypatch: pytest.Mon
     assert driver.now == over + 100 * MS
 
 
-def test_stop_all_broadcasts_a_stop_and_then_checks_each_drive(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, _, sims = che_drives(monkeypatch, 3, runs_s=1)
+def test_stop_all_broadcasts_a_stop_and_then_checks_each_drive() -> None:
+    line, _, sims = che_drives(3, runs_s=1)
     begun = len(line.frames)
     stopped = line.bus.stop_all()
     assert line.frames[begun][1] == "00 06 10 00 00 05 4C D8"
@@ -414,9 +394,9 @@ def test_stop_all_broadcasts_a_stop_and_then_checks_each_drive(monkeypatch: pyte
     assert all_stopped(line, sims)
 
 
-def test_each_drive_is_stopped_if_the_broadcast_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_drive_is_stopped_if_the_broadcast_fails() -> None:
     """The port is lost during the broadcast, and comes back."""
-    line, _, sims = che_drives(monkeypatch, 2, runs_s=0)
+    line, _, sims = che_drives(2, runs_s=0)
 
     def fails(request: Message) -> bytes | None:
         if request.address == 0:
@@ -430,13 +410,13 @@ def test_each_drive_is_stopped_if_the_broadcast_fails(monkeypatch: pytest.Monkey
     assert all_stopped(line, sims)
 
 
-def test_stop_all_reports_each_drive(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stop_all_reports_each_drive() -> None:
     sims: list[Any] = [
         simulated(InvtCHE(1, maximum_frequency=50)),
         simulated(ErmanERG220(2)),
         simulated(InvtCHE(3)),
     ]
-    line = SimulatedBus(monkeypatch, *sims)
+    line = SimulatedBus(*sims)
     for sim in sims:
         line.attach(sim.drive)
     sims[2]["device"] = 0x010A

@@ -58,10 +58,10 @@ STOPS: dict[str, Stop] = {
 
 
 @table("way", STOPS)
-def test_a_stop_has_the_outcome_done_unknown_or_failed(monkeypatch: pytest.MonkeyPatch, way: str) -> None:
-    _, drive, _ = one(monkeypatch, InnovertIBD(1))
+def test_a_stop_has_the_outcome_done_unknown_or_failed(way: str) -> None:
+    _, drive, _ = one(InnovertIBD(1))
     assert STOPS[way](drive)[drive.name].ok
-    line, drive, _ = one(monkeypatch, InnovertIBD(1))
+    line, drive, _ = one(InnovertIBD(1))
     line.loses = is_write
     assert STOPS[way](drive)[drive.name].outcome is CommandOutcome.UNKNOWN
 
@@ -69,7 +69,7 @@ def test_a_stop_has_the_outcome_done_unknown_or_failed(monkeypatch: pytest.Monke
         refusal = Message(request.address, request.function, request.start, exception=1)
         return build_reply(drive.framing, refusal) if is_write(request) else None
 
-    line, drive, _ = one(monkeypatch, InnovertIBD(1))
+    line, drive, _ = one(InnovertIBD(1))
     line.answers = refuse
     result = STOPS[way](drive)[drive.name]
     assert result.outcome is CommandOutcome.FAILED
@@ -84,8 +84,8 @@ def test_a_stop_of_a_removed_line_has_the_outcome_unknown_for_each_drive() -> No
     assert [one.outcome for one in stop_line(gone, ["a", "b"], None).values()] == [CommandOutcome.UNKNOWN] * 2
 
 
-def test_the_stop_of_a_removed_drive_is_not_sent(monkeypatch: pytest.MonkeyPatch) -> None:
-    line = SimulatedBus(monkeypatch, simulated(InvtCHE(1)))
+def test_the_stop_of_a_removed_drive_is_not_sent() -> None:
+    line = SimulatedBus(simulated(InvtCHE(1)))
     found = stop_line(lambda: line.bus, ["gone"], None)
     assert found["gone"].outcome is CommandOutcome.NOT_SENT
     assert isinstance(found["gone"].error, NotAttached)
@@ -106,10 +106,8 @@ def test_commands_to_a_drive_without_a_line_are_not_sent() -> None:
         ("ten", CommandOutcome.REFUSED, "setpoint"),
     ],
 )
-def test_a_write_returns_a_result_and_never_raises(
-    monkeypatch: pytest.MonkeyPatch, value: Any, outcome: CommandOutcome, text: str
-) -> None:
-    _, mill, _ = one(monkeypatch, InvtCHE(1, name="mill", maximum_frequency=50))
+def test_a_write_returns_a_result_and_never_raises(value: Any, outcome: CommandOutcome, text: str) -> None:
+    _, mill, _ = one(InvtCHE(1, name="mill", maximum_frequency=50))
     result = write_register(mill, "setpoint", value)
     assert result.outcome is outcome, result
     assert result.text.startswith(text)

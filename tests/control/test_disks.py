@@ -114,10 +114,10 @@ def _is_record(line: bytes) -> bool:
 
 
 def test_a_stop_is_sent_despite_a_full_disk_and_later_records_are_written(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = tmp_path / "audit.jsonl"
-    line, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50), audit=path)
+    line, drive, sim = one(InvtCHE(1, maximum_frequency=50), audit=path)
     drive.set_frequency(20)
     drive.start()
     with full_at(path.stat().st_size + 50):
@@ -137,11 +137,9 @@ def test_a_stop_is_sent_despite_a_full_disk_and_later_records_are_written(
     ]
 
 
-def test_in_a_noted_first_block_a_full_disk_prevents_writes_but_not_stops(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_in_a_noted_first_block_a_full_disk_prevents_writes_but_not_stops(tmp_path: Path) -> None:
     path = tmp_path / "audit.jsonl"
-    line = SimulatedBus(monkeypatch, simulated(InvtCHE(1, maximum_frequency=50)), audit=path)
+    line = SimulatedBus(simulated(InvtCHE(1, maximum_frequency=50)), audit=path)
     drive = line.attach(InvtCHE(1, maximum_frequency=50))
     with noted_first():
         drive.set_frequency(20)
@@ -166,11 +164,9 @@ def test_in_a_noted_first_block_a_full_disk_prevents_writes_but_not_stops(
     assert noted[-2:] == [("setpoint = 50.00 %", "called", False), ("setpoint = 50.00 %", "done", True)]
 
 
-def test_an_interrupted_stop_is_recorded_as_sent_but_unknown(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_an_interrupted_stop_is_recorded_as_sent_but_unknown(tmp_path: Path) -> None:
     path = tmp_path / "audit.jsonl"
-    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50), audit=path)
+    line, drive, _ = one(InvtCHE(1, maximum_frequency=50), audit=path)
     line.bus.check_identity(drive)
 
     def press(request: Message) -> bytes | None:
@@ -191,7 +187,7 @@ def test_a_stop_has_two_audit_records_however_often_it_is_sent(
 ) -> None:
     """The first record is written before the first frame is sent, so it survives a kill of the process."""
     path = tmp_path / "audit.jsonl"
-    line = SimulatedBus(monkeypatch, *(simulated(InvtCHE(address)) for address in (1, 2)), audit=path)
+    line = SimulatedBus(*(simulated(InvtCHE(address)) for address in (1, 2)), audit=path)
     drives = [line.attach(InvtCHE(address)) for address in (1, 2)]
     monkeypatch.setattr(write_records, "CALLED_S", PATIENCE_S)
     noted_at_first: list[dict[str, Any]] = []
@@ -239,11 +235,9 @@ def test_opening_the_audit_log_on_a_hung_disk_times_out(
     answers.set()
 
 
-def test_an_audit_log_in_a_read_only_directory_is_refused_before_anything_is_sent(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_an_audit_log_in_a_read_only_directory_is_refused_before_anything_is_sent() -> None:
     with read_only_directory() as directory, pytest.raises(PermissionError, match=r"audit\.jsonl"):
-        one(monkeypatch, InvtCHE(1), audit=directory / "audit.jsonl")
+        one(InvtCHE(1), audit=directory / "audit.jsonl")
 
 
 # ---- the ledger ----
@@ -272,10 +266,10 @@ def test_an_eeprom_ledger_created_on_a_full_disk_works_when_there_is_room(tmp_pa
     assert writes(ledger) == 1
 
 
-def test_an_unwritable_eeprom_ledger_prevents_writes_but_not_stops(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unwritable_eeprom_ledger_prevents_writes_but_not_stops() -> None:
     with read_only_directory() as directory:
         for path in (directory / "wear.sqlite", directory / "deep" / "wear.sqlite"):
-            line, drive, _ = one(monkeypatch, DelixiModbus(1), ledger=path)
+            line, drive, _ = one(DelixiModbus(1), ledger=path)
             with pytest.raises(OSError, match=r"the ledger of EEPROM writes .*wear\.sqlite cannot be kept"):
                 drive.set_frequency(10)
             assert line.written == []
@@ -330,7 +324,7 @@ def test_a_setpoint_loop_writes_once_a_minute_despite_a_clock_set_back(
 ) -> None:
     """The EEPROM is written at most once a minute, and once more when the clock jumps back."""
     log = tmp_path / "audit.jsonl"
-    line, drive, sim = one(monkeypatch, DelixiModbus(1), audit=log)
+    line, drive, sim = one(DelixiModbus(1), audit=log)
     utc = [1_700_000_000 * 10**9]
     monkeypatch.setattr("multidrop.transport.clock.utc_minus_monotonic_ns", lambda: utc[0])
     tried = []
@@ -354,11 +348,9 @@ def test_a_setpoint_loop_writes_once_a_minute_despite_a_clock_set_back(
     assert times != sorted(times)  # the clock was set back between two records
 
 
-def test_the_eeprom_ledger_keeps_its_counts_when_the_bus_is_closed(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_the_eeprom_ledger_keeps_its_counts_when_the_bus_is_closed(tmp_path: Path) -> None:
     for life in range(3):
-        _, drive, _ = one(monkeypatch, ErmanERG220(1), ledger=tmp_path / "wear.sqlite")
+        _, drive, _ = one(ErmanERG220(1), ledger=tmp_path / "wear.sqlite")
         drive.set_frequency(10 + life)
     assert writes(Ledger(tmp_path / "wear.sqlite")) == 3
 

@@ -92,8 +92,8 @@ NOT_ARRIVING = ("never", "silent", "exception", "deaf", "echo")  # faults with w
 class Cell:
     """One drive in a situation of TABLE. A fault affects the line from the verb's first write on."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, family: str, situation: str) -> None:
-        self.line, self.drive, self.sim = one(monkeypatch, FAMILIES[family](1))
+    def __init__(self, family: str, situation: str) -> None:
+        self.line, self.drive, self.sim = one(FAMILIES[family](1))
         self.sim.motor.acceleration_time = self.sim.motor.deceleration_time = 1.0
         self._is_start = STARTED_BY[family]
         if situation != "fresh":
@@ -204,7 +204,7 @@ def test_each_verb_has_the_expected_outcome_during_each_fault(
             return
         with pytest.MonkeyPatch.context() as monkeypatch:
             monkeypatch.setattr(records, "LEAST_INTERVAL", 0.0)  # s between two EEPROM writes of one register
-            tried = Cell(monkeypatch, family, situation)
+            tried = Cell(family, situation)
             tried.strike(fault)
             outcome = tried.outcome(verb)
             wanted = second if family in SECOND.get((verb, second), ()) else first

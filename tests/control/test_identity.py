@@ -8,7 +8,6 @@ from typing import Any
 from unittest.mock import patch
 
 import pytest
-from examples import usually
 from lines import line, plant, polled, until
 from motors import MAKE, ReceivedRequests, at_highest_rate
 from simulated_bus import SimulatedBus, is_write, one
@@ -28,7 +27,6 @@ from multidrop.families.invt_che import CHEControl
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 from multidrop.transport import clock, peers
 
-every_family = pytest.mark.parametrize("model", usually(*MAKE))
 GOODRIVE = 0x010A  # device code of another INVT series; a CHE has 0101H
 GOODRIVE_DEVICE = 0x2103  # register of the device code in a Goodrive (Goodrive200A manual p. 140)
 
@@ -80,7 +78,7 @@ def test_a_replaced_drive_is_not_started() -> None:
 
 def test_a_drive_replaced_while_its_write_is_counted_is_not_written(monkeypatch: pytest.MonkeyPatch) -> None:
     """A locked ledger delays the write; meanwhile the adapter is unplugged, and another line plugged in."""
-    line, drive, _ = one(monkeypatch, YD1000(1))
+    line, drive, _ = one(YD1000(1))
 
     def replace(*given: object) -> str:
         line.sims, line.queue = (simulated(DelixiModbus(1)),), object()
@@ -135,66 +133,75 @@ def test_a_drive_is_identified_once_after_ten_seconds_without_a_reply(
         assert looks == ["look"]
 
 
-@table("model", MAKE)
-def test_a_stop_after_an_idle_time_is_sent_without_reading_first(model: str) -> None:
+@pytest.mark.usefixtures("_turns_awaited")
+@pytest.mark.parametrize("model", MAKE)
+@pytest.mark.parametrize("is_silent", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_stop_after_an_idle_or_silent_time_is_sent_without_reading_first(
+    model: str, is_silent: bool
+) -> None:
     with known(model) as (bus, drive, received):
-        bus.peer(drive).c.answered_ns -= 2 * PAUSE_NS
+        drive.set_frequency(10)
+        drive.start()
+        if is_silent:
+            be_silent(bus, drive, received)
+        else:
+            bus.peer(drive).c.answered_ns -= 2 * PAUSE_NS
         received.requests.clear()
         drive.stop()
         assert received.requests[0] == received.writes[0]
 
 
-@pytest.mark.slow
-@pytest.mark.usefixtures("_turns_awaited")
-@pytest.mark.parametrize("model", MAKE)
-def test_a_stop_of_a_silent_drive_is_sent_without_reading_first(model: str) -> None:
-    with known(model) as (bus, drive, received):
-        drive.set_frequency(10)
-        drive.start()
-        be_silent(bus, drive, received)
-        drive.stop()
-        assert received.requests[0] == received.writes[0]
-
-
-def _asleep(bus: Bus, drive: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def _asleep(bus: Bus, drive: Any, received: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     at_ns = clock.boottime_ns
     monkeypatch.setattr(clock, "boottime_ns", lambda: at_ns() + 2 * PAUSE_NS)
 
 
-def _idle_and_asleep(bus: Bus, drive: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def _idle_and_asleep(bus: Bus, drive: Any, received: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Let 0.6 PAUSE_NS pass awake and 0.6 PAUSE_NS asleep: together more than PAUSE_NS."""
     now_ns, boottime_ns = clock.now_ns, clock.boottime_ns
     monkeypatch.setattr(clock, "now_ns", lambda: now_ns() + 6 * PAUSE_NS // 10)
     monkeypatch.setattr(clock, "boottime_ns", lambda: boottime_ns() + 12 * PAUSE_NS // 10)
 
 
-def _idle(bus: Bus, drive: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def _idle(bus: Bus, drive: Any, received: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     bus.peer(drive).c.answered_ns -= 2 * PAUSE_NS
     at_ns = clock.now_ns
     monkeypatch.setattr(clock, "now_ns", lambda: at_ns() + 2 * PAUSE_NS)
-    _asleep(bus, drive, monkeypatch)  # wait until the boot-time clock has advanced too
+    _asleep(bus, drive, received, monkeypatch)  # wait until the boot-time clock has advanced too
 
 
-def _read_since(bus: Bus, drive: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def _read_since(bus: Bus, drive: Any, received: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     bus.peer(drive).c.answered_ns -= 2 * PAUSE_NS
     drive.read(next(register for register in drive.registers.values() if register.readable))
 
 
-def _on_another_port(bus: Bus, drive: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def _on_another_port(bus: Bus, drive: Any, received: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     bus.line.reopen()
+
+
+def _on_another_bus(bus: Bus, drive: Any, received: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    bus.detach(drive)
+    bus.attach(drive)
+
+
+def _silent_then_idle(bus: Bus, drive: Any, received: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    be_silent(bus, drive, received)  # so that the start begins with an identity check
+    bus.peer(drive).c.answered_ns -= 2 * PAUSE_NS
+
+
+LOSSES = [_asleep, _idle, _idle_and_asleep, _read_since, _on_another_port, _on_another_bus]
 
 
 @pytest.mark.usefixtures("_turns_awaited")
 @pytest.mark.parametrize("model", ["innovert-ibd", "delixi-native"])
-@pytest.mark.parametrize("lose", [_asleep, _idle, _idle_and_asleep, _read_since, _on_another_port])
+@pytest.mark.parametrize("lose", [*LOSSES, pytest.param(_silent_then_idle, marks=pytest.mark.slow)])
 def test_a_setpoint_that_cannot_be_read_is_forgotten_once_the_drive_may_have_lost_its_power(
-    model: str, lose: Callable[[Bus, Any, pytest.MonkeyPatch], None], monkeypatch: pytest.MonkeyPatch
+    model: str, lose: Callable[..., None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The drive may even have been replaced between two polls."""
     with known(model) as (bus, drive, received):
         drive.set_frequency(10)
         received.requests.clear()
-        lose(bus, drive, monkeypatch)
+        lose(bus, drive, received, monkeypatch)
         with pytest.raises(
             WriteForbidden, match="cannot report its setpoint: call set_frequency before start"
         ):
@@ -202,33 +209,6 @@ def test_a_setpoint_that_cannot_be_read_is_forgotten_once_the_drive_may_have_los
         assert received.writes == []
         drive.set_frequency(10)
         drive.start()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("model", ["innovert-ibd", "delixi-native"])
-def test_a_setpoint_is_forgotten_if_the_check_before_start_ends_a_long_silence(model: str) -> None:
-    with known(model) as (bus, drive, received):
-        drive.set_frequency(10)
-        be_silent(bus, drive, received)
-        bus.peer(drive).c.answered_ns -= 2 * PAUSE_NS
-        with pytest.raises(
-            WriteForbidden, match="cannot report its setpoint: call set_frequency before start"
-        ):
-            drive.start()
-        assert received.writes == []
-
-
-@pytest.mark.usefixtures("_turns_awaited")
-@pytest.mark.parametrize("model", ["innovert-ibd", "delixi-native"])
-def test_a_setpoint_that_was_written_through_another_bus_is_not_known(model: str) -> None:
-    with known(model) as (bus, drive, received):
-        drive.set_frequency(10)
-        bus.detach(drive)
-        bus.attach(drive)
-        received.requests.clear()
-        with pytest.raises(WriteForbidden, match="cannot report its setpoint"):
-            drive.start()
-        assert received.writes == []
 
 
 @pytest.mark.slow
@@ -265,8 +245,8 @@ def test_missed_polls_count_as_silence() -> None:
 # ---- drives that were detached and attached again ----
 
 
-def test_a_detached_drive_is_identified_again_before_a_start(monkeypatch: pytest.MonkeyPatch) -> None:
-    bus, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+def test_a_detached_drive_is_identified_again_before_a_start() -> None:
+    bus, drive, sim = one(InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(10)
     bus.bus.detach(drive)
     bus.attach(drive)
@@ -276,9 +256,9 @@ def test_a_detached_drive_is_identified_again_before_a_start(monkeypatch: pytest
     assert len(bus.written) == 1
 
 
-def test_a_detached_drive_is_identified_again_before_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_detached_drive_is_identified_again_before_a_stop() -> None:
     """Sending a stop does not confirm the drive's identity for a start."""
-    bus, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    bus, drive, sim = one(InvtCHE(1, maximum_frequency=50))
     odd = [build_reply(Framing.RTU, Message(1, 3, data=bytes([0, device]))) for device in (3, 4)]
     bus.answers = lambda request: odd.pop(0) if odd else None
     drive.stop()  # sent, because the two wrong identities differ
@@ -291,8 +271,8 @@ def test_a_detached_drive_is_identified_again_before_a_stop(monkeypatch: pytest.
     assert len(bus.written) == begun
 
 
-def test_detaching_a_drive_forgets_that_its_identity_check_failed(monkeypatch: pytest.MonkeyPatch) -> None:
-    bus, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+def test_detaching_a_drive_forgets_that_its_identity_check_failed() -> None:
+    bus, drive, sim = one(InvtCHE(1, maximum_frequency=50))
     sim["device"] = GOODRIVE
     check = bus.bus._writer.identity_check
     for _ in range(2):  # without the detach, the second wrong identity would withhold the stop
@@ -324,7 +304,7 @@ def test_one_register_is_read_before_the_first_stop_without_waiting(
     monkeypatch: pytest.MonkeyPatch, is_lost: bool
 ) -> None:
     """The read shows whether the adapter echoes, before an echo could pass for the drive's confirmation."""
-    bus = SimulatedBus(monkeypatch, simulated(Mute(1)))
+    bus = SimulatedBus(simulated(Mute(1)))
     drive, carry_out = bus.attach(Mute(1)), bus.carry_out
     asked: list[tuple[bool, bool]] = []
 
@@ -348,10 +328,8 @@ def test_one_register_is_read_before_the_first_stop_without_waiting(
 
 
 @pytest.mark.parametrize("is_in_step", [True, False])
-def test_an_unambiguous_identity_check_before_a_stop_confirms_the_drive(
-    monkeypatch: pytest.MonkeyPatch, is_in_step: bool
-) -> None:
-    bus, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+def test_an_unambiguous_identity_check_before_a_stop_confirms_the_drive(is_in_step: bool) -> None:
+    bus, drive, _ = one(InvtCHE(1, maximum_frequency=50))
 
     def fall_out_of_step(request: Message) -> bytes | None:
         if not is_in_step:
@@ -364,11 +342,9 @@ def test_an_unambiguous_identity_check_before_a_stop_confirms_the_drive(
     assert bus.bus.knows_identity(drive) is is_in_step
 
 
-def test_an_identity_check_by_undocumented_registers_never_withholds_a_stop(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_an_identity_check_by_undocumented_registers_never_withholds_a_stop() -> None:
     """The IBD's `identify` reads registers that its manual does not document."""
-    bus = SimulatedBus(monkeypatch, simulated(InnovertIBD(1)))
+    bus = SimulatedBus(simulated(InnovertIBD(1)))
     bus.attach(InvtCHE(1))
 
     def refuse(request: Message) -> bytes | None:
@@ -383,10 +359,8 @@ def test_an_identity_check_by_undocumented_registers_never_withholds_a_stop(
 
 
 @pytest.mark.parametrize(("share", "looks"), [(0.6, 0), (1.1, 1)])
-def test_a_drive_that_answered_recently_is_not_identified_again(
-    monkeypatch: pytest.MonkeyPatch, share: float, looks: int
-) -> None:
-    bus, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+def test_a_drive_that_answered_recently_is_not_identified_again(share: float, looks: int) -> None:
+    bus, drive, _ = one(InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(10)
     bus.sleep(share * PAUSE_NS / 1e9)
     begun = len(bus.frames)
@@ -409,10 +383,8 @@ REFUSALS = [
 
 
 @table(("model", "code"), REFUSALS)
-def test_a_stop_is_sent_after_an_exception_to_the_identity_check(
-    monkeypatch: pytest.MonkeyPatch, model: str, code: int
-) -> None:
-    line, drive, sim = one(monkeypatch, MAKE[model](1))
+def test_a_stop_is_sent_after_an_exception_to_the_identity_check(model: str, code: int) -> None:
+    line, drive, sim = one(MAKE[model](1))
     sim.motor.energised = True
 
     def refuse(request: Message) -> bytes | None:
@@ -435,7 +407,7 @@ def test_a_stop_is_sent_after_an_exception_to_the_identity_check(
 def test_a_stop_and_its_identity_check_do_not_wait_for_late_replies(
     monkeypatch: pytest.MonkeyPatch, model: str
 ) -> None:
-    line, drive, _ = one(monkeypatch, MAKE[model](1))
+    line, drive, _ = one(MAKE[model](1))
     insisted: list[bool] = []
     carry_out = line.carry_out
 
@@ -451,45 +423,34 @@ def test_a_stop_and_its_identity_check_do_not_wait_for_late_replies(
 
 
 @table("model", MAKE)
-def test_a_lost_identity_check_is_not_repeated_before_the_stop(
-    monkeypatch: pytest.MonkeyPatch, model: str
-) -> None:
-    line, drive, _ = one(monkeypatch, MAKE[model](1))
+def test_a_lost_identity_check_is_not_repeated_before_the_stop(model: str) -> None:
+    line, drive, _ = one(MAKE[model](1))
     line.loses = lambda request: not writes(line)
     drive.stop()
     assert first(line, 0, STOPS[model]) == 1
 
 
-def test_one_unexpected_identity_reply_does_not_prove_another_family(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, _ = one(monkeypatch, InvtCHE(1))
-    odd = build_reply(Framing.RTU, Message(1, 3, data=b"\0\3"))
-    line.answers = lambda request: odd if len(line.frames) == 1 else None
-    drive.stop()
-    assert first(line, 0, STOPS["invt-che"]) is not None
-
-
-def test_two_different_unexpected_replies_do_not_prove_another_family(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    line, drive, _ = one(monkeypatch, InvtCHE(1))
-    odd = [build_reply(Framing.RTU, Message(1, 3, data=bytes([0, device]))) for device in (3, 4)]
+@pytest.mark.parametrize("codes", [(3,), (3, 4)])
+def test_identity_replies_prove_no_other_family_unless_two_agree(codes: tuple[int, ...]) -> None:
+    line, drive, _ = one(InvtCHE(1))
+    odd = [build_reply(Framing.RTU, Message(1, 3, data=bytes([0, code]))) for code in codes]
     line.answers = lambda request: odd.pop(0) if odd else None
     drive.stop()
     assert odd == []
     assert STOPS["invt-che"](writes(line)[0])
 
 
-def test_a_stop_is_never_refused_after_a_missed_reply(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_is_never_refused_after_a_missed_reply() -> None:
     """The drive's next reply may belong to an earlier request."""
-    line, drive, sim = one(monkeypatch, InvtCHE(1))
+    line, drive, sim = one(InvtCHE(1))
     sim["device"] = 0x010A
     line.bus.peer(drive).c.history.ended[10] = 1
     drive.stop()
     assert line.frames[0][1] == "01 06 10 00 00 05 4D 09"  # the stop is sent first, without an identity check
 
 
-def test_the_error_of_a_withheld_stop_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, sim = one(monkeypatch, InvtCHE(1))
+def test_the_error_of_a_withheld_stop_says_what_to_do() -> None:
+    line, drive, sim = one(InvtCHE(1))
     sim["device"] = 0x010A
     with pytest.raises(
         WriteForbidden, match=r"no stop was sent .* two reads showed .*010AH.* Use the hard-wired stop"
@@ -511,11 +472,11 @@ OTHERS: Sequence[tuple[Drive, Drive]] = (  # (declared drive, drive on the line)
 
 @table("pair", OTHERS)
 def test_the_error_of_a_withheld_stop_names_the_command_for_the_other_family(
-    monkeypatch: pytest.MonkeyPatch, pair: tuple[Drive, Drive]
+    pair: tuple[Drive, Drive],
 ) -> None:
     declared, there = pair
     sim = simulated(there)
-    line = SimulatedBus(monkeypatch, sim)
+    line = SimulatedBus(sim)
     drive = line.attach(declared)
     with pytest.raises(WriteForbidden, match=f"multidrop stop PORT {there.model} 1"):
         drive.stop()
@@ -552,9 +513,9 @@ def shows(line: SimulatedBus, drive: Drive, name: str, count: int) -> None:
 @table(("model", "name", "count"), UNEXPECTED_COUNTS)
 @table("how", ["stop", "stop_all", "write"])
 def test_one_unexpected_value_prevents_a_start_but_no_stop(
-    monkeypatch: pytest.MonkeyPatch, model: str, name: str, count: int, how: str
+    model: str, name: str, count: int, how: str
 ) -> None:
-    line, drive, _ = one(monkeypatch, MAKE[model](1))
+    line, drive, _ = one(MAKE[model](1))
     shows(line, drive, name, count)
     with pytest.raises(WriteForbidden):
         drive.set_frequency(20)
@@ -574,11 +535,9 @@ def test_one_unexpected_value_prevents_a_start_but_no_stop(
 
 
 @table("model", MAKE)
-def test_a_drive_that_refuses_the_identity_check_is_sent_its_stop(
-    monkeypatch: pytest.MonkeyPatch, model: str
-) -> None:
+def test_a_drive_that_refuses_the_identity_check_is_sent_its_stop(model: str) -> None:
     """Reads with function 04 are answered: only the ERMAN's identity check uses them."""
-    line, drive, _ = one(monkeypatch, MAKE[model](1))
+    line, drive, _ = one(MAKE[model](1))
 
     def refuse(request: Message) -> bytes | None:
         if is_write(request) or request.function == 4:
@@ -592,12 +551,10 @@ def test_a_drive_that_refuses_the_identity_check_is_sent_its_stop(
     assert STOPS[model](writes(line)[0])
 
 
-def test_no_stop_waits_for_the_second_identity_check_of_another_drive(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_no_stop_waits_for_the_second_identity_check_of_another_drive() -> None:
     """The stop of an identified drive does not wait for the first check of another drive either."""
     others = [YD1000(1), InvtCHE(2, maximum_frequency=50), InvtCHE(3, maximum_frequency=50)]
-    line = SimulatedBus(monkeypatch, *(simulated(drive) for drive in others))
+    line = SimulatedBus(*(simulated(drive) for drive in others))
     line.attach(InvtCHE(1, maximum_frequency=50))
     for drive in others[1:]:
         line.attach(drive)
@@ -615,10 +572,8 @@ def test_no_stop_waits_for_the_second_identity_check_of_another_drive(
 
 
 @pytest.mark.parametrize("suspicions", [1, 2])
-def test_a_stop_by_a_plain_write_is_withheld_if_another_family_answers_twice(
-    monkeypatch: pytest.MonkeyPatch, suspicions: int
-) -> None:
-    line, drive, _ = one(monkeypatch, InvtCHE(1))
+def test_a_stop_by_a_plain_write_is_withheld_if_another_family_answers_twice(suspicions: int) -> None:
+    line, drive, _ = one(InvtCHE(1))
     odd = build_reply(Framing.RTU, Message(1, 3, data=b"\x01\x0a"))  # a Goodrive300L
     line.answers = lambda request: odd if len(line.frames) <= suspicions else None
     if suspicions == 1:

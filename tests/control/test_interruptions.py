@@ -127,10 +127,8 @@ class Careful(Own):
 
 @pytest.mark.parametrize("model", MAKE)
 @pytest.mark.parametrize("all_of_them", [False, True])
-def test_a_stop_that_is_interrupted_is_sent_once_more(
-    monkeypatch: pytest.MonkeyPatch, model: str, all_of_them: bool
-) -> None:
-    line, drive, _ = one(monkeypatch, MAKE[model](1))
+def test_a_stop_that_is_interrupted_is_sent_once_more(model: str, all_of_them: bool) -> None:
+    line, drive, _ = one(MAKE[model](1))
     drive.set_frequency(20)
     drive.start()
     begun = len(line.frames)
@@ -153,9 +151,9 @@ def test_a_stop_that_is_interrupted_is_sent_once_more(
     ]
 
 
-def test_an_interrupted_stop_also_ends_a_jog(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_stop_also_ends_a_jog() -> None:
     """The motor's state is not read after an interruption, so the motor may be jogging."""
-    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    line, drive, _ = one(InvtCHE(1, maximum_frequency=50))
     drive.jog()
     begun = len(writes(line))
 
@@ -172,11 +170,9 @@ def test_an_interrupted_stop_also_ends_a_jog(monkeypatch: pytest.MonkeyPatch) ->
     assert [request for request, _ in line.frames[-3:]] == sent
 
 
-def test_a_stop_that_only_reads_does_not_prevent_the_repetition_of_another(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_stop_that_only_reads_does_not_prevent_the_repetition_of_another() -> None:
     sims: list[Any] = [simulated(Restless(1)), simulated(InvtCHE(2, maximum_frequency=50))]
-    line = SimulatedBus(monkeypatch, *sims)
+    line = SimulatedBus(*sims)
     restless, other = (line.attach(sim.drive) for sim in sims)
     other.set_frequency(20)
     other.start()
@@ -191,10 +187,8 @@ def test_a_stop_that_only_reads_does_not_prevent_the_repetition_of_another(
     assert [request.address for request in writes(line, begun)][:4] == [1, 2, 2, 2]
 
 
-def test_an_interrupted_stop_is_sent_again_with_its_reads_but_without_its_waits(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    line = SimulatedBus(monkeypatch, simulated(Careful(1)))
+def test_an_interrupted_stop_is_sent_again_with_its_reads_but_without_its_waits() -> None:
+    line = SimulatedBus(simulated(Careful(1)))
     drive = line.attach(Careful(1))
     drive.write(drive.ratio, 3.0)
     line.bus.check_identity(drive)
@@ -214,8 +208,8 @@ def test_an_interrupted_stop_is_sent_again_with_its_reads_but_without_its_waits(
     ]
 
 
-def test_a_second_interruption_ends_the_repetition_of_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+def test_a_second_interruption_ends_the_repetition_of_a_stop() -> None:
+    line, drive, _ = one(InvtCHE(1, maximum_frequency=50))
     line.bus.check_identity(drive)
 
     def press(request: Message) -> bytes | None:
@@ -238,10 +232,8 @@ def test_a_second_interruption_ends_the_repetition_of_a_stop(monkeypatch: pytest
         ("after", "control = FORWARD was sent and confirmed, but its effect was not seen"),
     ],
 )
-def test_an_interrupted_start_says_what_was_sent(
-    monkeypatch: pytest.MonkeyPatch, moment: str, note: str
-) -> None:
-    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+def test_an_interrupted_start_says_what_was_sent(moment: str, note: str) -> None:
+    line, drive, _ = one(InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(20)
 
     def press(request: Message) -> bytes | None:

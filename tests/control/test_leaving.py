@@ -26,8 +26,8 @@ from multidrop.transport.aside_log import flush
 class RunningPair:
     """A simulated bus with two drives whose motors turn."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.line, self.drives, self.sims = che_drives(monkeypatch, 2, runs_s=10)
+    def __init__(self) -> None:
+        self.line, self.drives, self.sims = che_drives(2, runs_s=10)
         self.bus = self.line.bus
         self.line.frames.clear()
 
@@ -37,8 +37,8 @@ class RunningPair:
 
 
 @pytest.fixture
-def pair(monkeypatch: pytest.MonkeyPatch) -> Iterator[RunningPair]:
-    made = RunningPair(monkeypatch)
+def pair() -> Iterator[RunningPair]:
+    made = RunningPair()
     yield made
     made.bus.close()
 
@@ -140,8 +140,8 @@ def test_closing_a_bus_waits_for_all_stops_unless_a_third_signal_comes(
     assert waited == ([] if is_cut_short else [()])
 
 
-def test_the_argument_stop_on_exit_makes_a_bus_stop_its_drives(monkeypatch: pytest.MonkeyPatch) -> None:
-    line = SimulatedBus(monkeypatch, simulated(InvtCHE(1)), stop_on_exit=True)
+def test_the_argument_stop_on_exit_makes_a_bus_stop_its_drives() -> None:
+    line = SimulatedBus(simulated(InvtCHE(1)), stop_on_exit=True)
     assert line.bus.stops_on_exit
     line.bus.close()
 
@@ -159,9 +159,9 @@ def test_a_bus_with_stop_on_exit_can_only_be_made_on_the_main_thread(monkeypatch
 # ---- one bus at a time ----
 
 
-def test_attaching_a_drive_of_another_open_bus_raises(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, _ = one(monkeypatch, InvtCHE(1))
-    other = SimulatedBus(monkeypatch)
+def test_attaching_a_drive_of_another_open_bus_raises() -> None:
+    line, drive, _ = one(InvtCHE(1))
+    other = SimulatedBus()
     with pytest.raises(ValueError, match=r"invt-che@1 is on the bus at hall: detach it there first"):
         other.attach(drive)
     assert other.bus.drives == []
@@ -174,24 +174,24 @@ def test_attaching_a_drive_of_another_open_bus_raises(monkeypatch: pytest.Monkey
 
 def test_a_drive_can_be_attached_to_another_bus_while_its_bus_closes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Once the first bus is closed completely, the drive is still attached to the second bus."""
-    line, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    line, drive, sim = one(InvtCHE(1, maximum_frequency=50))
     before = line.bus
     free = before._attached.free
     monkeypatch.setattr(before._attached, "free", lambda: None)
     before.close()
-    after = SimulatedBus(monkeypatch, sim)
+    after = SimulatedBus(sim)
     after.attach(drive)
     free()
     assert drive.bus is after.bus
     with pytest.raises(ValueError, match="is on the bus at hall: detach it there first"):
-        SimulatedBus(monkeypatch).attach(drive)
+        SimulatedBus().attach(drive)
     drive.stop()
     assert line.written == []
     assert len(after.written) == 1
 
 
 def test_a_drive_detached_by_another_thread_is_not_detached_twice(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, _ = one(monkeypatch, InvtCHE(1))
+    line, drive, _ = one(InvtCHE(1))
     latches = line.bus._latches
     await_stops = latches.await_stops
 
@@ -205,14 +205,14 @@ def test_a_drive_detached_by_another_thread_is_not_detached_twice(monkeypatch: p
     line.attach(drive)
 
 
-def test_closing_a_bus_releases_its_drives(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, _ = one(monkeypatch, InvtCHE(1))
+def test_closing_a_bus_releases_its_drives() -> None:
+    line, drive, _ = one(InvtCHE(1))
     line.bus.close()
     assert drive.bus is None
 
 
 def test_threads_that_attach_concurrently_add_one_drive_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    line = SimulatedBus(monkeypatch)
+    line = SimulatedBus()
     together = threading.Barrier(8)
     add, inside, most = line.bus._exchanges.peers.add, set[str](), 0
 
@@ -252,9 +252,9 @@ def test_threads_that_attach_concurrently_add_one_drive_at_a_time(monkeypatch: p
 # ---- latches ----
 
 
-def test_a_thread_does_not_wait_for_its_own_interrupted_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_thread_does_not_wait_for_its_own_interrupted_stop() -> None:
     """Otherwise the exit from a `with` block, by an exception of a signal handler, would never end."""
-    line, drive, _ = one(monkeypatch, InvtCHE(1))
+    line, drive, _ = one(InvtCHE(1))
     latches, stop = line.bus._latches, object()
     latches.begin(stop, [drive])
     latches.await_stops()
@@ -269,9 +269,9 @@ def test_a_thread_does_not_wait_for_its_own_interrupted_stop(monkeypatch: pytest
     assert latches.latch(drive).permit().is_good
 
 
-def test_the_motor_of_a_drive_attached_after_leave_cannot_be_started(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_motor_of_a_drive_attached_after_leave_cannot_be_started() -> None:
     """After `leave`, the process is ending, and could not stop the motor."""
-    line, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    line, drive, sim = one(InvtCHE(1, maximum_frequency=50))
     line.bus.leave()
     line.bus.detach(drive)
     line.attach(drive)
@@ -284,12 +284,12 @@ def test_the_motor_of_a_drive_attached_after_leave_cannot_be_started(monkeypatch
     assert not sim.motor.energised
 
 
-def test_a_detached_drive_is_freed_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_detached_drive_is_freed_at_once() -> None:
     """It is freed without a garbage collection, so memory does not grow if drives change for years.
 
     `knows_identity` accepts a detached drive, because a drive may be detached just before the call.
     """
-    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    line, drive, _ = one(InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(20)
     drive.stop()
     line.bus.detach(drive)

@@ -151,7 +151,7 @@ def test_ledger_entries_of_older_versions_count_for_the_same_port(old: str, spel
 # ---- writes that wear an EEPROM ----
 
 
-def test_registers_in_ram_are_not_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_registers_in_ram_are_not_counted(tmp_path: Path) -> None:
     class Fan(Drive):
         """A user's own drive."""
 
@@ -162,7 +162,7 @@ def test_registers_in_ram_are_not_counted(tmp_path: Path, monkeypatch: pytest.Mo
 
     ledger = Ledger(tmp_path / "wear")
     sim = SimulatedDrive(Fan(1))
-    line = SimulatedBus(monkeypatch, sim, ledger=ledger)
+    line = SimulatedBus(sim, ledger=ledger)
     fan = line.attach(Fan(1, ram=["known"]))
     for register in (fan.relay, fan.speed, fan.known):
         fan.write(register, 1)
@@ -189,7 +189,7 @@ def test_a_user_without_a_home_can_stop_drives_but_not_write_eeprom(monkeypatch:
     monkeypatch.setattr(eeprom_ledger, "NO_HOME", Path("/dev/null"), raising=False)
     toy = simulated(Toy(1))
     toy["status"] = Status(0)
-    line = SimulatedBus(monkeypatch, toy)
+    line = SimulatedBus(toy)
     drive = line.attach(Toy(1))
     drive.stop()
     with pytest.raises(OSError, match=r"EEPROM writes /dev/null/multidrop/wear\.sqlite cannot be kept"):

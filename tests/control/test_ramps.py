@@ -37,8 +37,8 @@ def steps(line: SimulatedBus) -> list[int]:
     return [int(frame[12:17].replace(" ", ""), 16) for frame in line.written]
 
 
-def test_a_ramp_waits_between_its_steps_but_not_after_the_last(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, _ = one(monkeypatch, YD1000(1))
+def test_a_ramp_waits_between_its_steps_but_not_after_the_last() -> None:
+    line, drive, _ = one(YD1000(1))
     drive.set_frequency(10)
     line.frames.clear()
     written_at: list[float] = []
@@ -66,9 +66,9 @@ def test_a_ramp_waits_between_its_steps_but_not_after_the_last(monkeypatch: pyte
     ],
 )
 def test_the_steps_of_a_ramp_are_written_in_the_drive_s_unit(
-    monkeypatch: pytest.MonkeyPatch, drive: Any, before: float, to: float, rate: float, counts: list[int]
+    drive: Any, before: float, to: float, rate: float, counts: list[int]
 ) -> None:
-    line, drive, _ = one(monkeypatch, drive)
+    line, drive, _ = one(drive)
     drive.set_frequency(before)
     line.frames.clear()
     ramp(drive, to, rate=rate, every=1.0)
@@ -90,15 +90,15 @@ class Ramped(Toy):
             yield from self._write_setpoint(self.frequency, hz)
 
 
-def ramped(monkeypatch: pytest.MonkeyPatch, family: type[Drive], **options: float) -> tuple[Any, Any, Any]:
+def ramped(family: type[Drive], **options: float) -> tuple[Any, Any, Any]:
     sim = simulated(family(1))
-    line = SimulatedBus(monkeypatch, sim)
+    line = SimulatedBus(sim)
     return line, line.attach(family(1, **options)), sim
 
 
-def test_a_ramp_starts_from_the_setpoint_that_it_reads(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_ramp_starts_from_the_setpoint_that_it_reads() -> None:
     """The ramp also works if `set_frequency` writes nothing because the setpoint is already reached."""
-    line, drive, _ = ramped(monkeypatch, Ramped)
+    line, drive, _ = ramped(Ramped)
     ramp(drive, 2.0, rate=1.0, every=1.0)
     assert steps(line) == [100, 200]
     ramp(drive, 2.0, rate=1.0)
@@ -114,10 +114,8 @@ def test_a_ramp_starts_from_the_setpoint_that_it_reads(monkeypatch: pytest.Monke
 
 
 @pytest.mark.parametrize(("most", "seconds"), [(50, 0), (0, 10)])
-def test_a_ramp_needs_a_rate_if_the_drive_s_own_rate_is_zero_or_infinite(
-    monkeypatch: pytest.MonkeyPatch, most: int, seconds: int
-) -> None:
-    line, drive, sim = ramped(monkeypatch, Ramped)
+def test_a_ramp_needs_a_rate_if_the_drive_s_own_rate_is_zero_or_infinite(most: int, seconds: int) -> None:
+    line, drive, sim = ramped(Ramped)
     sim["maximum_frequency"], sim["acceleration_time"] = most, seconds
     with pytest.raises(
         WriteForbidden, match="the acceleration of ramped@1 cannot be read: give a rate in Hz/s"
@@ -135,12 +133,12 @@ class Nameless(Ramped):
     identify = Drive.identify
 
 
-def test_a_ramp_of_an_unconfirmed_drive_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, _ = ramped(monkeypatch, Nameless, confirmed=0)
+def test_a_ramp_of_an_unconfirmed_drive_is_refused() -> None:
+    line, drive, _ = ramped(Nameless, confirmed=0)
     with pytest.raises(WriteForbidden, match="confirmed = 1"):
         ramp(drive, 2.0, rate=1.0)
     assert line.frames == []
-    line, drive, _ = ramped(monkeypatch, Nameless, confirmed=1)
+    line, drive, _ = ramped(Nameless, confirmed=1)
     ramp(drive, 2.0, rate=1.0, every=1.0)
     assert steps(line) == [100, 200]
 
@@ -149,10 +147,8 @@ def test_a_ramp_of_an_unconfirmed_drive_is_refused(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.parametrize("gap", [0, 0.5])
-def test_staggered_starts_keep_the_gap_between_them_which_may_be_zero(
-    monkeypatch: pytest.MonkeyPatch, gap: float
-) -> None:
-    line, drives, sims = che_drives(monkeypatch, 2)
+def test_staggered_starts_keep_the_gap_between_them_which_may_be_zero(gap: float) -> None:
+    line, drives, sims = che_drives(2)
     begun = line.seconds
     start_staggered(drives, gap)
     assert all(sim.motor.energised for sim in sims)
@@ -160,12 +156,10 @@ def test_staggered_starts_keep_the_gap_between_them_which_may_be_zero(
 
 
 @pytest.mark.parametrize("gap", [4.0, 25.0])
-def test_drives_waiting_for_a_staggered_start_are_read_regularly(
-    monkeypatch: pytest.MonkeyPatch, gap: float
-) -> None:
+def test_drives_waiting_for_a_staggered_start_are_read_regularly(gap: float) -> None:
     """Otherwise a start would be refused: after a silence, a setpoint that cannot be read counts as lost."""
     sims: list[Any] = [simulated(InnovertIBD(address, maximum_frequency=50)) for address in range(1, 6)]
-    line = SimulatedBus(monkeypatch, *sims)
+    line = SimulatedBus(*sims)
     drives = [line.attach(sim.drive) for sim in sims]
     for drive in drives:
         drive.set_frequency(20)
@@ -178,7 +172,7 @@ def test_drives_waiting_for_a_staggered_start_are_read_regularly(
 def test_no_drive_is_started_after_a_suspension_between_staggered_starts(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    line, drives, sims = che_drives(monkeypatch, 2)
+    line, drives, sims = che_drives(2)
 
     def sleep(seconds: float) -> None:
         line.sleep(seconds)
@@ -191,8 +185,8 @@ def test_no_drive_is_started_after_a_suspension_between_staggered_starts(
     assert not any(sim.motor.energised for sim in sims)
 
 
-def test_a_staggered_start_does_not_stop_drives_it_never_reached(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drives, sims = che_drives(monkeypatch, 3)
+def test_a_staggered_start_does_not_stop_drives_it_never_reached() -> None:
+    line, drives, sims = che_drives(3)
     sims[1].trip(4)
     line.frames.clear()
     with pytest.raises(WriteForbidden, match="OC1"):
@@ -200,12 +194,10 @@ def test_a_staggered_start_does_not_stop_drives_it_never_reached(monkeypatch: py
     assert {request.address for request, _ in line.frames if is_write(request)} == {1, 2}
 
 
-def test_a_failed_staggered_start_sends_no_stop_to_a_drive_of_unknown_identity(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_failed_staggered_start_sends_no_stop_to_a_drive_of_unknown_identity() -> None:
     """An IBD's stop writes 0001H to the address 2000H, which runs an INVT Goodrive."""
     sims: list[Any] = [simulated(InnovertIBD(1)), simulated(PROFILES["invt-goodrive"](2))]
-    line = SimulatedBus(monkeypatch, *sims)
+    line = SimulatedBus(*sims)
     drives: list[Any] = [line.attach(InnovertIBD(address)) for address in (1, 2)]
     drives[0].set_frequency(20)
     with pytest.raises(WriteForbidden, match="confirmed = 1"):
@@ -220,7 +212,7 @@ def test_a_failed_staggered_start_sends_no_stop_to_a_drive_of_unknown_identity(
 def test_a_drive_that_leaves_its_bus_during_a_staggered_start_leaves_no_motor_running(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    line, drives, sims = che_drives(monkeypatch, 2)
+    line, drives, sims = che_drives(2)
     line.frames.clear()
 
     def leave(request: Message) -> None:
@@ -266,11 +258,9 @@ class NotedStop:
         """Return None: the motor has stopped."""
 
 
-def test_a_failed_staggered_start_stops_the_started_drives_in_parallel(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_failed_staggered_start_stops_the_started_drives_in_parallel() -> None:
     """The stop of a silent drive does not delay the stops of the other drives."""
-    _, drives, sims = che_drives(monkeypatch, 3)
+    _, drives, sims = che_drives(3)
     sims[2].trip(4)
     noted = NotedCalls(drives)
     others = threading.Semaphore(0)
@@ -295,7 +285,7 @@ class NoThread(threading.Thread):
 def test_without_threads_all_started_drives_get_a_stop_before_any_wait(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    _, drives, sims = che_drives(monkeypatch, 2)
+    _, drives, sims = che_drives(2)
     sims[1].trip(4)
     noted = NotedCalls(drives)
     monkeypatch.setattr(threading, "Thread", NoThread)
@@ -305,7 +295,7 @@ def test_without_threads_all_started_drives_get_a_stop_before_any_wait(
 
 
 def test_interrupted_stops_without_threads_are_each_sent_once_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    _, drives, sims = che_drives(monkeypatch, 2)
+    _, drives, sims = che_drives(2)
     sims[1].trip(4)
     noted = NotedCalls(drives)
 
@@ -323,8 +313,8 @@ def test_interrupted_stops_without_threads_are_each_sent_once_more(monkeypatch: 
 # ---- setpoints and limits of a ramp ----
 
 
-def test_a_failed_staggered_start_stops_the_drives_it_started(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drives, sims = che_drives(monkeypatch, 3)
+def test_a_failed_staggered_start_stops_the_drives_it_started() -> None:
+    line, drives, sims = che_drives(3)
     begun = line.seconds
     start_staggered(drives, 2.0, Direction.FORWARD)
     assert 4 <= line.seconds - begun < 6
@@ -338,8 +328,8 @@ def test_a_failed_staggered_start_stops_the_drives_it_started(monkeypatch: pytes
     assert all_stopped(line, sims)
 
 
-def test_an_invalid_gap_starts_no_motor(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+def test_an_invalid_gap_starts_no_motor() -> None:
+    line, drive, _ = one(InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(20)
     line.frames.clear()
     for gap in (-1.0, float("nan"), float("inf")):
@@ -348,8 +338,8 @@ def test_an_invalid_gap_starts_no_motor(monkeypatch: pytest.MonkeyPatch) -> None
     assert line.frames == []
 
 
-def test_a_ramp_is_never_faster_than_the_drive_s_own_ramp(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, _ = one(monkeypatch, YD1000(1))
+def test_a_ramp_is_never_faster_than_the_drive_s_own_ramp() -> None:
+    line, drive, _ = one(YD1000(1))
     drive.set_frequency(10)
     line.frames.clear()
     ramp(drive, 20.0)  # 80 Hz in 10 s: 4 Hz in half a second
@@ -364,8 +354,8 @@ def test_a_ramp_is_never_faster_than_the_drive_s_own_ramp(monkeypatch: pytest.Mo
     assert line.written[-2][:17] == "01 06 10 01 07 9E"
 
 
-def test_a_ramp_without_a_known_acceleration_needs_a_rate(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+def test_a_ramp_without_a_known_acceleration_needs_a_rate() -> None:
+    line, drive, _ = one(InvtCHE(1, maximum_frequency=50))
     with pytest.raises(WriteForbidden, match="give a rate"):
         ramp(drive, 20.0)
     ramp(drive, 2.0, rate=2.0)
@@ -373,8 +363,8 @@ def test_a_ramp_without_a_known_acceleration_needs_a_rate(monkeypatch: pytest.Mo
 
 
 @pytest.mark.parametrize("model", ["yd1000", "invt-che", "innovert-ibd"])
-def test_a_ramp_to_a_forbidden_setpoint_sends_no_step(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
-    line, drive, _ = one(monkeypatch, MAKE[model](1))
+def test_a_ramp_to_a_forbidden_setpoint_sends_no_step(model: str) -> None:
+    line, drive, _ = one(MAKE[model](1))
     drive.set_frequency(10)
     line.frames.clear()
     for hz in (5000.0, -5.0, float("inf"), float("nan")):
@@ -385,10 +375,8 @@ def test_a_ramp_to_a_forbidden_setpoint_sends_no_step(monkeypatch: pytest.Monkey
     assert len(line.written) == 1
 
 
-def test_a_ramp_above_the_drive_s_limit_is_refused_before_its_first_step(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    line, drive, _ = one(monkeypatch, YD1000(1))
+def test_a_ramp_above_the_drive_s_limit_is_refused_before_its_first_step() -> None:
+    line, drive, _ = one(YD1000(1))
     drive.set_frequency(10)
     line.frames.clear()
     with pytest.raises(WriteForbidden, match=r"82\.50 Hz is above maximum_frequency, which is 80 Hz"):
@@ -396,9 +384,9 @@ def test_a_ramp_above_the_drive_s_limit_is_refused_before_its_first_step(
     assert line.written == []
 
 
-def test_a_ramp_starts_from_a_setpoint_of_a_plain_write(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_ramp_starts_from_a_setpoint_of_a_plain_write() -> None:
     """The setpoint cannot be read. A ramp from the older setpoint would start with a jump."""
-    line, drive, _ = one(monkeypatch, InnovertIBD(1, confirmed=1))
+    line, drive, _ = one(InnovertIBD(1, confirmed=1))
     drive.set_frequency(40)
     drive.write(drive.frequency, 10.0)
     line.frames.clear()
@@ -406,8 +394,8 @@ def test_a_ramp_starts_from_a_setpoint_of_a_plain_write(monkeypatch: pytest.Monk
     assert steps(line) == [1200, 1400]
 
 
-def test_a_ramp_is_refused_after_an_unconfirmed_setpoint(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, _ = one(monkeypatch, InnovertIBD(1, confirmed=1))
+def test_a_ramp_is_refused_after_an_unconfirmed_setpoint() -> None:
+    line, drive, _ = one(InnovertIBD(1, confirmed=1))
     drive.set_frequency(40)
     line.loses = is_write
     with pytest.raises(Unconfirmed):
@@ -417,8 +405,8 @@ def test_a_ramp_is_refused_after_an_unconfirmed_setpoint(monkeypatch: pytest.Mon
             act()
 
 
-def test_a_ramp_is_refused_after_a_broadcast_setpoint(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, _ = one(monkeypatch, InnovertIBD(1, confirmed=1))
+def test_a_ramp_is_refused_after_a_broadcast_setpoint() -> None:
+    line, drive, _ = one(InnovertIBD(1, confirmed=1))
     drive.set_frequency(40)
     line.bus.broadcast(drive.frequency, 0)
     with pytest.raises(WriteForbidden, match="cannot report its setpoint"):
@@ -436,8 +424,8 @@ class ShareToy(Toy):
         yield from self._write_setpoint(self.share, hz / 80 * 100)
 
 
-def test_a_ramp_of_a_percentage_of_an_unknown_maximum_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    line = SimulatedBus(monkeypatch, simulated(ShareToy(1)))
+def test_a_ramp_of_a_percentage_of_an_unknown_maximum_is_refused() -> None:
+    line = SimulatedBus(simulated(ShareToy(1)))
     with pytest.raises(
         WriteForbidden, match=r"is in %: a ramp needs maximum_frequency, which is not declared"
     ):
@@ -455,8 +443,8 @@ class AliasToy(Toy):
         yield from self._write_setpoint(self.frequency, hz)
 
 
-def test_a_ramp_through_a_ram_alias_writes_no_eeprom(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    line = SimulatedBus(monkeypatch, simulated(AliasToy(1)), ledger=tmp_path / "wear.sqlite")
+def test_a_ramp_through_a_ram_alias_writes_no_eeprom(tmp_path: Path) -> None:
+    line = SimulatedBus(simulated(AliasToy(1)), ledger=tmp_path / "wear.sqlite")
     toy = line.attach(AliasToy(1))
     ramp(toy, 10, rate=8.0)
     assert [frame[:17] for frame in line.written] == [
@@ -467,8 +455,8 @@ def test_a_ramp_through_a_ram_alias_writes_no_eeprom(monkeypatch: pytest.MonkeyP
     assert Ledger(tmp_path / "wear.sqlite").wear(0) == []
 
 
-def test_a_ramp_from_an_unknown_setpoint_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    line = SimulatedBus(monkeypatch)
+def test_a_ramp_from_an_unknown_setpoint_is_refused() -> None:
+    line = SimulatedBus()
     toy = line.attach(Toy(1, name="toy"))
     with pytest.raises(
         WriteForbidden, match=r"^toy cannot report its setpoint: call set_frequency before a ramp$"
@@ -477,8 +465,8 @@ def test_a_ramp_from_an_unknown_setpoint_is_refused(monkeypatch: pytest.MonkeyPa
     assert line.frames == []
 
 
-def test_a_ramp_of_a_setpoint_in_eeprom_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, _ = one(monkeypatch, DelixiModbus(1))
+def test_a_ramp_of_a_setpoint_in_eeprom_is_refused() -> None:
+    line, drive, _ = one(DelixiModbus(1))
     with pytest.raises(WriteForbidden, match="EEPROM"):
         ramp(drive, 20.0)
     assert line.written == []
@@ -494,10 +482,8 @@ class KeptToy(Toy):
         yield from self._write_setpoint(self.frequency, hz)
 
 
-def test_a_ramp_to_a_command_in_eeprom_is_refused_before_its_first_step(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    line = SimulatedBus(monkeypatch, simulated(KeptToy(1)))
+def test_a_ramp_to_a_command_in_eeprom_is_refused_before_its_first_step() -> None:
+    line = SimulatedBus(simulated(KeptToy(1)))
     toy = line.attach(KeptToy(1))
     toy.set_frequency(5)
     line.frames.clear()

@@ -43,10 +43,8 @@ every_family = pytest.mark.parametrize("model", MAKE)
 
 
 @every_family
-def test_a_plain_write_never_starts_a_motor_nor_resets_a_fault(
-    monkeypatch: pytest.MonkeyPatch, model: str
-) -> None:
-    line, drive, sim = one(monkeypatch, MAKE[model](1))
+def test_a_plain_write_never_starts_a_motor_nor_resets_a_fault(model: str) -> None:
+    line, drive, sim = one(MAKE[model](1))
     controls = [each for each in drive.registers.values() if each.harmless is not None]
     assert controls
     refusals = 0
@@ -67,8 +65,8 @@ def test_a_plain_write_never_starts_a_motor_nor_resets_a_fault(
     assert not sim.motor.energised
 
 
-def test_a_plain_write_may_stop_the_motor(monkeypatch: pytest.MonkeyPatch) -> None:
-    _, drive, _ = one(monkeypatch, InvtCHE(1))
+def test_a_plain_write_may_stop_the_motor() -> None:
+    _, drive, _ = one(InvtCHE(1))
     assert drive.write(drive.control, CHEControl.STOP) is CHEControl.STOP
 
 
@@ -103,9 +101,9 @@ def test_a_plain_write_may_stop_the_motor(monkeypatch: pytest.MonkeyPatch) -> No
     ],
 )
 def test_a_write_that_its_register_does_not_allow_is_not_sent(
-    monkeypatch: pytest.MonkeyPatch, drive: Drive, name: str, value: float, sentence: str
+    drive: Drive, name: str, value: float, sentence: str
 ) -> None:
-    line, _, _ = one(monkeypatch, drive)
+    line, _, _ = one(drive)
     register = drive.register(name)
     with pytest.raises(WriteForbidden, match=sentence) as refusal:
         drive.write(register, value)
@@ -114,10 +112,8 @@ def test_a_write_that_its_register_does_not_allow_is_not_sent(
     assert line.written == []
 
 
-def test_writes_allowed_only_at_rest_are_refused_while_the_motor_turns(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    line, drive, sim = one(monkeypatch, YD1000(1))
+def test_writes_allowed_only_at_rest_are_refused_while_the_motor_turns() -> None:
+    line, drive, sim = one(YD1000(1))
     drive.set_frequency(20)
     drive.start()
     line.sleep(1)
@@ -130,8 +126,8 @@ def test_writes_allowed_only_at_rest_are_refused_while_the_motor_turns(
     assert sim["maximum_frequency"] == 90
 
 
-def test_a_raw_request_bypasses_all_rules_and_errors_name_it_as_raw(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, _ = one(monkeypatch, YD1000(1))
+def test_a_raw_request_bypasses_all_rules_and_errors_name_it_as_raw() -> None:
+    line, drive, _ = one(YD1000(1))
     assert drive.send_raw(6, 0x0000, b"\x00\x01") == b"\x00\x01"
     assert line.written == ["01 06 00 00 00 01 48 0A"]
     line.loses = lambda request: True
@@ -148,7 +144,7 @@ def test_only_the_first_write_is_preceded_by_an_identity_check(
     monkeypatch: pytest.MonkeyPatch, model: str
 ) -> None:
     monkeypatch.setattr(records, "LEAST_INTERVAL", 0.0)  # s between writes of one register to an EEPROM
-    line, drive, _ = one(monkeypatch, MAKE[model](1))
+    line, drive, _ = one(MAKE[model](1))
     drive.set_frequency(20)
     assert line.frames[0][1] not in line.written
     assert line.written
@@ -163,11 +159,9 @@ def test_only_the_first_write_is_preceded_by_an_identity_check(
     assert looks == ["look"]
 
 
-def test_an_unidentified_innovert_ibd_needs_confirmed_for_writes(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_an_unidentified_innovert_ibd_needs_confirmed_for_writes() -> None:
     for confirmed in (0, 1):
-        line, drive, sim = one(monkeypatch, InnovertIBD(1, confirmed=confirmed))
+        line, drive, sim = one(InnovertIBD(1, confirmed=confirmed))
         sim["address_setting"] = 0
         if confirmed:
             drive.set_frequency(20)
@@ -183,10 +177,8 @@ def test_an_unidentified_innovert_ibd_needs_confirmed_for_writes(
 # ---- outcomes ----
 
 
-def test_try_write_reports_done_taken_as_or_unconfirmed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    line, drive, _ = one(monkeypatch, InnovertIBD(1))
+def test_try_write_reports_done_taken_as_or_unconfirmed() -> None:
+    line, drive, _ = one(InnovertIBD(1))
     outcome = drive.try_write(drive.acceleration_time, 20.0)
     assert (outcome.effect, outcome.held) == (Effect.DONE, 20.0)
     assert str(outcome) == "innovert-ibd@1: acceleration_time = 20.0 s: done (read back)"
@@ -210,7 +202,7 @@ def test_try_write_reports_done_taken_as_or_unconfirmed(
 
 @every_family
 def test_only_stops_are_sent_while_a_late_reply_is_due(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
-    line, drive, _ = one(monkeypatch, MAKE[model](1))
+    line, drive, _ = one(MAKE[model](1))
     insisted: list[bool] = []
     carry_out = line.carry_out
 
@@ -229,10 +221,8 @@ def test_only_stops_are_sent_while_a_late_reply_is_due(monkeypatch: pytest.Monke
     assert all(insisted)
 
 
-def test_a_modbus_exception_is_reported_with_its_meaning_for_the_family(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    line, drive, _ = one(monkeypatch, InvtCHE(1))
+def test_a_modbus_exception_is_reported_with_its_meaning_for_the_family() -> None:
+    line, drive, _ = one(InvtCHE(1))
     line.bus.check_identity(drive)
     refusal = build_reply(Framing.RTU, Message(1, 6, exception=0x12))
     line.answers = lambda request: refusal if request.function == 6 else None
@@ -243,15 +233,15 @@ def test_a_modbus_exception_is_reported_with_its_meaning_for_the_family(
     assert len(line.written) == 1
 
 
-def test_a_watchdog_that_cannot_be_read_is_described_by_the_family(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, _ = one(monkeypatch, YD1000(1))
+def test_a_watchdog_that_cannot_be_read_is_described_by_the_family() -> None:
+    line, drive, _ = one(YD1000(1))
     refusal = build_reply(Framing.RTU, Message(1, 3, exception=2))
     line.answers = lambda request: refusal if request.function == 3 else None
     assert line.bus.watchdog(drive) == drive.watchdog
 
 
-def test_an_expired_write_is_not_sent(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+def test_an_expired_write_is_not_sent() -> None:
+    line, drive, _ = one(InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(20)
     written = list(line.written)
     line.queue_time = 1.5
@@ -284,7 +274,7 @@ def test_an_unsent_write_is_not_reported_as_unconfirmed(
     monkeypatch: pytest.MonkeyPatch, result: Failure
 ) -> None:
     """The write is not reported as unconfirmed even if a later read of the script fails."""
-    line = SimulatedBus(monkeypatch, simulated(Tidy(1)))
+    line = SimulatedBus(simulated(Tidy(1)))
     drive = line.attach(Tidy(1, confirmed=1))
     carry_out = line.carry_out
 
@@ -304,9 +294,9 @@ def test_an_unsent_write_is_not_reported_as_unconfirmed(
 # ---- faults on the way ----
 
 
-def test_an_exception_to_a_read_after_a_start_raises_unconfirmed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_exception_to_a_read_after_a_start_raises_unconfirmed() -> None:
     """Raising DriveException would mean that the drive refused the start."""
-    line, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    line, drive, sim = one(InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(20)
     busy = build_reply(Framing.RTU, Message(1, 3, exception=6))
     line.answers = lambda request: busy if starts(line, "invt-che") and not is_write(request) else None
@@ -316,8 +306,8 @@ def test_an_exception_to_a_read_after_a_start_raises_unconfirmed(monkeypatch: py
     assert sim.motor.energised
 
 
-def test_a_start_succeeds_although_its_first_reads_are_lost(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+def test_a_start_succeeds_although_its_first_reads_are_lost() -> None:
+    line, drive, sim = one(InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(20)
     spoilt: list[Message] = []
 
@@ -335,7 +325,7 @@ def test_a_start_succeeds_although_its_first_reads_are_lost(monkeypatch: pytest.
 
 
 def test_a_trip_during_a_start_raises_not_verified(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    line, drive, sim = one(InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(20)
     control = sim.write_handlers["control"]
     trips = {"control": lambda sim, raw: sim.trip(4) if raw == 1 else control(sim, raw)}
@@ -350,11 +340,9 @@ def test_a_trip_during_a_start_raises_not_verified(monkeypatch: pytest.MonkeyPat
     assert drive.state().condition is Condition.STOPPED
 
 
-def test_after_a_power_cycle_a_start_is_refused_until_a_setpoint_is_written(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_after_a_power_cycle_a_start_is_refused_until_a_setpoint_is_written() -> None:
     """The drive loses its setpoint in the power cycle. Its motor stays off, and the next start is refused."""
-    line, drive, sim = one(monkeypatch, YD1000(1))
+    line, drive, sim = one(YD1000(1))
     drive.set_frequency(40)
     drive.start()
     line.sleep(1)
@@ -374,9 +362,9 @@ def test_after_a_power_cycle_a_start_is_refused_until_a_setpoint_is_written(
     assert sim.motor.energised
 
 
-def test_a_start_is_refused_if_another_client_changed_the_setpoint(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_start_is_refused_if_another_client_changed_the_setpoint() -> None:
     """Another client changes the setpoint between our write and our start: the start is refused."""
-    line, drive, sim = one(monkeypatch, YD1000(1))
+    line, drive, sim = one(YD1000(1))
     drive.set_frequency(10)
     sim["frequency"] = 60.0
     with pytest.raises(WriteForbidden, match=r"holds 60\.00 Hz and not 10\.00 Hz"):
@@ -388,7 +376,7 @@ def test_a_start_is_refused_if_another_client_changed_the_setpoint(monkeypatch: 
 def test_a_setpoint_that_the_drive_limits_is_reported_with_the_limited_value(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    line, drive, sim = one(monkeypatch, ErmanERG220(1))
+    line, drive, sim = one(ErmanERG220(1))
     accept = type(sim).accept
     monkeypatch.setattr(
         type(sim),
@@ -406,8 +394,8 @@ def test_a_setpoint_that_the_drive_limits_is_reported_with_the_limited_value(
 
 
 @pytest.mark.slow
-def test_a_setpoint_loop_to_eeprom_is_refused_with_advice(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, sim = one(monkeypatch, DelixiModbus(1))
+def test_a_setpoint_loop_to_eeprom_is_refused_with_advice() -> None:
+    line, drive, sim = one(DelixiModbus(1))
     drive.set_frequency(10.0)
     for step in range(60):  # once a second for a minute
         with pytest.raises(WriteForbidden, match=r"once in 60 s at most; change it less often: .*P00\.02"):
@@ -421,8 +409,8 @@ def test_a_setpoint_loop_to_eeprom_is_refused_with_advice(monkeypatch: pytest.Mo
     assert sim.counters.eeprom_writes["frequency"] == 2
 
 
-def test_writes_beyond_the_yearly_budget_are_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    line, drive, sim = one(monkeypatch, ErmanERG220(1), ledger=Ledger(tmp_path / "wear", budget=5))
+def test_writes_beyond_the_yearly_budget_are_refused(tmp_path: Path) -> None:
+    line, drive, sim = one(ErmanERG220(1), ledger=Ledger(tmp_path / "wear", budget=5))
     for step in range(5):  # unknown memory: the yearly budget applies, but not the interval of a minute
         drive.set_frequency(10 + step)
     with pytest.raises(WriteForbidden, match=r'written 5 times in a year.*ram = \["frequency"\].*b\.007'):
@@ -432,9 +420,9 @@ def test_writes_beyond_the_yearly_budget_are_refused(monkeypatch: pytest.MonkeyP
     drive.set_frequency(45)
 
 
-def test_a_register_declared_as_ram_is_not_counted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_register_declared_as_ram_is_not_counted(tmp_path: Path) -> None:
     ledger = Ledger(tmp_path / "wear", budget=1)
-    line, drive, _ = one(monkeypatch, ErmanERG220(1, ram=["frequency"]), ledger=ledger)
+    line, drive, _ = one(ErmanERG220(1, ram=["frequency"]), ledger=ledger)
     for step in range(20):
         drive.set_frequency(10 + step)
     assert ledger.wear(line.seconds) == []
@@ -444,16 +432,14 @@ def test_a_register_declared_as_ram_is_not_counted(monkeypatch: pytest.MonkeyPat
         ErmanERG220(1, ram=["frequenzy"])
 
 
-def test_a_write_through_a_ram_alias_is_not_counted_as_an_eeprom_write(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_a_write_through_a_ram_alias_is_not_counted_as_an_eeprom_write(tmp_path: Path) -> None:
     class Mine(InvtCHE):
         """A CHE with a parameter declared by its owner."""
 
         acceleration_time = parameter(12, "s", step=0.1, place="P0.07")
 
     ledger = Ledger(tmp_path / "wear")
-    line, drive, sim = one(monkeypatch, Mine(1), ledger=ledger)
+    line, drive, sim = one(Mine(1), ledger=ledger)
     drive.write(Mine.acceleration_time, 20.0)
     assert line.written == ["01 06 80 0C 00 C8 61 9F"]
     assert not sim.counters.eeprom_writes
@@ -463,15 +449,15 @@ def test_a_write_through_a_ram_alias_is_not_counted_as_an_eeprom_write(
 # ---- the watchdog, identity checks of own families ----
 
 
-def test_the_drives_watchdog_setting_is_read_if_it_is_readable(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, sim = one(monkeypatch, YD1000(1))
+def test_the_drives_watchdog_setting_is_read_if_it_is_readable() -> None:
+    line, drive, sim = one(YD1000(1))
     assert not line.frames  # attaching sends nothing
     assert line.bus.watchdog(drive) == (
         "its watchdog (communication_timeout) is off: the motor runs on when the client dies"
     )
     sim["communication_timeout"] = 5
     assert line.bus.watchdog(drive) == "its watchdog (communication_timeout) acts 5 s after the last message"
-    line, drive, _ = one(monkeypatch, ErmanERG220(1))
+    line, drive, _ = one(ErmanERG220(1))
     assert "no watchdog" in line.bus.watchdog(drive)
     assert line.written == []
 
@@ -491,20 +477,20 @@ def test_harmless_raw_counts_only_stop_the_motor_or_withdraw_a_command() -> None
                 assert {part for name in names for part in name.split("|")} <= allowed
 
 
-def test_a_write_to_a_silent_drive_without_identify_is_not_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_write_to_a_silent_drive_without_identify_is_not_sent() -> None:
     class Mine(Drive):
         """A family without `identify`."""
 
         speed = setting(5, "rpm", kept=Kept.RAM)
 
-    line = SimulatedBus(monkeypatch)
+    line = SimulatedBus()
     drive = line.attach(Mine(1))
     with pytest.raises(NoReply):
         drive.write(Mine.speed, 10)
     assert line.written == []
 
 
-def test_an_identity_check_may_wait_between_its_reads(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_identity_check_may_wait_between_its_reads() -> None:
     class Sleepy(Toy):
         """A family whose `identify` waits between two reads."""
 
@@ -514,14 +500,14 @@ def test_an_identity_check_may_wait_between_its_reads(monkeypatch: pytest.Monkey
             yield from wait(3.0)
             yield from read(Toy.fault)
 
-    line = SimulatedBus(monkeypatch, simulated(Sleepy(1)))
+    line = SimulatedBus(simulated(Sleepy(1)))
     begun = line.seconds
     line.bus.check_identity(line.attach(Sleepy(1)))
     assert [(each.start, each.count) for each, _ in line.frames] == [(5, 1), (4, 1)]
     assert line.seconds - begun == pytest.approx(3.0 + 2 * EXCHANGE_TIME)
 
 
-def test_an_identity_check_that_writes_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_identity_check_that_writes_is_refused() -> None:
     class Meddler(Toy):
         """A family whose `identify` writes by mistake."""
 
@@ -529,23 +515,21 @@ def test_an_identity_check_that_writes_is_refused(monkeypatch: pytest.MonkeyPatc
         def identify(self) -> Script[None]:
             yield from write(Toy.frequency, 10.0)
 
-    line = SimulatedBus(monkeypatch, simulated(Meddler(1)))
+    line = SimulatedBus(simulated(Meddler(1)))
     drive = line.attach(Meddler(1, name="meddler"))
     with pytest.raises(WriteForbidden, match=r"^meddler: an identity check must not write$"):
         drive.set_frequency(20.0)
     assert line.frames == []
 
 
-def test_writes_allowed_only_at_rest_are_refused_if_the_state_is_unreadable(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_writes_allowed_only_at_rest_are_refused_if_the_state_is_unreadable() -> None:
     class Mute(Drive):
         """A family without the verb `state`."""
 
         speed = reading(1, "rpm")
         ratio = setting(2, kept=Kept.RAM, while_running=False)
 
-    line = SimulatedBus(monkeypatch, simulated(Mute(1)))
+    line = SimulatedBus(simulated(Mute(1)))
     drive = line.attach(Mute(1, name="mute"))
     with pytest.raises(WriteForbidden) as refusal:
         drive.write(Mute.ratio, 3)
@@ -555,10 +539,8 @@ def test_writes_allowed_only_at_rest_are_refused_if_the_state_is_unreadable(
     assert line.written == []
 
 
-def test_the_bus_needs_no_ledger_before_the_first_write(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    line, drive, _ = one(monkeypatch, ErmanERG220(1), ledger=tmp_path / "none" / "wear")
+def test_the_bus_needs_no_ledger_before_the_first_write(tmp_path: Path) -> None:
+    line, drive, _ = one(ErmanERG220(1), ledger=tmp_path / "none" / "wear")
     assert drive.read(drive.frequency) == 0
     assert not (tmp_path / "none").exists()
     assert isinstance(line.bus, Bus)

@@ -179,12 +179,10 @@ def values(register: Register[Any]) -> st.SearchStrategy[Any]:
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
 @given(data=st.data())
-def test_no_sequence_of_calls_sends_a_forbidden_frame(
-    monkeypatch: pytest.MonkeyPatch, model: str, data: st.DataObject
-) -> None:
+def test_no_sequence_of_calls_sends_a_forbidden_frame(model: str, data: st.DataObject) -> None:
     sim: Any = simulated(MAKE[model](1))
     with TemporaryDirectory() as directory:
-        line = SimulatedBus(monkeypatch, sim, ledger=Path(directory) / "wear")
+        line = SimulatedBus(sim, ledger=Path(directory) / "wear")
         play(line, sim, model, data)
 
 

@@ -273,10 +273,8 @@ def dies_and_echoes(line: SimulatedBus, drive: Drive) -> None:
 
 
 @table("declared", DRIVES)
-def test_an_echo_does_not_confirm_a_stop_sent_as_a_plain_write(
-    monkeypatch: pytest.MonkeyPatch, declared: Drive
-) -> None:
-    line, drive, _ = one(monkeypatch, type(declared)(1, **declared.option))
+def test_an_echo_does_not_confirm_a_stop_sent_as_a_plain_write(declared: Drive) -> None:
+    line, drive, _ = one(type(declared)(1, **declared.option))
     stop = next(register for register in drive.registers.values() if register.harmless)
     value = stop.decode(stop.harmless[-1])
     assert drive.try_write(stop, value).effect is Effect.DONE
@@ -286,9 +284,9 @@ def test_an_echo_does_not_confirm_a_stop_sent_as_a_plain_write(
 
 
 @pytest.mark.parametrize("family", [InnovertIBD, DelixiNative])
-def test_an_echo_does_not_confirm_a_setpoint(monkeypatch: pytest.MonkeyPatch, family: type[Drive]) -> None:
+def test_an_echo_does_not_confirm_a_setpoint(family: type[Drive]) -> None:
     """The setpoint cannot be read back, so the echo is the only reply."""
-    line, drive, _ = one(monkeypatch, family(1))
+    line, drive, _ = one(family(1))
     drive.set_frequency(20)
     dies_and_echoes(line, drive)
     for write in (lambda: drive.write(drive.frequency, 25.0), lambda: drive.set_frequency(25.0)):
@@ -297,9 +295,9 @@ def test_an_echo_does_not_confirm_a_setpoint(monkeypatch: pytest.MonkeyPatch, fa
         assert drive.commanded is None  # unknown, so that no start or ramp relies on it
 
 
-def test_a_write_is_unconfirmed_if_the_next_read_reveals_an_echo(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_write_is_unconfirmed_if_the_next_read_reveals_an_echo() -> None:
     """The drive missed the write, and answers the read after it."""
-    line, drive, _ = one(monkeypatch, InnovertIBD(1))
+    line, drive, _ = one(InnovertIBD(1))
     drive.set_frequency(20)
 
     def echo(request: Message) -> bytes | None:
@@ -312,8 +310,8 @@ def test_a_write_is_unconfirmed_if_the_next_read_reveals_an_echo(monkeypatch: py
     assert "the reply was the adapter's echo" in str(outcome.failure)
 
 
-def test_an_echo_does_not_confirm_a_raw_request(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    line, drive, _ = one(monkeypatch, InnovertIBD(1), audit=tmp_path / "audit")
+def test_an_echo_does_not_confirm_a_raw_request(tmp_path: Path) -> None:
+    line, drive, _ = one(InnovertIBD(1), audit=tmp_path / "audit")
     drive.send_raw(6, 0x2001, b"\x07\xd0")
     dies_and_echoes(line, drive)
     with pytest.raises(Unconfirmed, match="echo"):
@@ -322,9 +320,9 @@ def test_an_echo_does_not_confirm_a_raw_request(monkeypatch: pytest.MonkeyPatch,
     assert [entry["outcome"] for entry in read_audit(tmp_path / "audit")] == ["done", "unconfirmed"]
 
 
-def test_a_write_is_confirmed_on_a_line_that_is_known_to_echo(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_write_is_confirmed_on_a_line_that_is_known_to_echo() -> None:
     """If the echo is known, the core can distinguish the drive's reply from the echo."""
-    line, drive, _ = one(monkeypatch, InnovertIBD(1))
+    line, drive, _ = one(InnovertIBD(1))
     line.has_echo = True
     drive.set_frequency(20)
     line.loses = lambda request: not is_write(request)

@@ -66,14 +66,12 @@ def is_ours(frame: FrameType) -> bool:
     return frame.f_code.co_filename.startswith(OURS)
 
 
-def check_failing(
-    monkeypatch: pytest.MonkeyPatch, nth: int, failure: type[BaseException], all_of_them: bool
-) -> bool:
+def check_failing(nth: int, failure: type[BaseException], all_of_them: bool) -> bool:
     """Raise `failure` at the nth opcode of a stop; check that motors stop and that no state is left behind.
 
     Return False if the stop has fewer opcodes.
     """
-    line, drives, sims = che_drives(monkeypatch, 2 if all_of_them else 1, runs_s=10)
+    line, drives, sims = che_drives(2 if all_of_them else 1, runs_s=10)
     begun_before = [drive.begin_call("start", drive.stops_called[0]) for drive in drives]
     stop, told, place = line.bus.stop_all if all_of_them else drives[0].stop, "", []
 
@@ -105,18 +103,15 @@ def test_a_stop_that_fails_at_any_opcode_is_sent_and_leaves_nothing_behind(
 ) -> None:
     first = FIRST_OPCODES + 1
     for nth in chain(range(first, first + 20), count(first + 20, step)):
-        with pytest.MonkeyPatch.context() as monkeypatch:
-            if not check_failing(monkeypatch, nth, failure, all_of_them):
-                break
+        if not check_failing(nth, failure, all_of_them):
+            break
     assert nth > 5_000
 
 
 @pytest.mark.parametrize("verb", ["stop", "coast", "stop_all"])
-def test_a_stop_called_by_a_signal_handler_cancels_the_interrupted_start(
-    monkeypatch: pytest.MonkeyPatch, verb: str
-) -> None:
+def test_a_stop_called_by_a_signal_handler_cancels_the_interrupted_start(verb: str) -> None:
     """The handler is called at each opcode from the first at which the interpreter may handle a signal."""
-    line, (drive,), (sim,) = che_drives(monkeypatch, runs_s=10)
+    line, (drive,), (sim,) = che_drives(runs_s=10)
     drive.stop()
     stop = line.bus.stop_all if verb == "stop_all" else getattr(drive, verb)
     start, first = drive.start, 9  # at an earlier opcode the stop precedes the start
@@ -131,9 +126,7 @@ def test_a_stop_called_by_a_signal_handler_cancels_the_interrupted_start(
 
 
 @pytest.mark.parametrize("failure", [SystemExit, KeyboardInterrupt, GeneratorExit])
-def test_a_script_that_raises_system_exit_leaves_no_other_motor_running(
-    monkeypatch: pytest.MonkeyPatch, failure: type[BaseException]
-) -> None:
+def test_a_script_that_raises_system_exit_leaves_no_other_motor_running(failure: type[BaseException]) -> None:
     """SystemExit is raised only after all stops are over, even if the other motor's first stops are lost."""
 
     class Ending(Fan):
@@ -145,7 +138,7 @@ def test_a_script_that_raises_system_exit_leaves_no_other_motor_running(
             raise failure
 
     sims: list[Any] = [simulated(Ending(1)), simulated(InvtCHE(2, maximum_frequency=50))]
-    line = SimulatedBus(monkeypatch, *sims)
+    line = SimulatedBus(*sims)
     _, other = (line.attach(sim.drive) for sim in sims)
     other.set_frequency(20)
     other.start()
@@ -184,7 +177,7 @@ def test_an_interrupted_stop_after_a_failed_staggered_start_stops_all(
         return frame.f_code is STOPPING and not text.startswith(("def stop", "threads:", "left =", "try:"))
 
     for nth in range(1, 12):
-        line, drives, sims = che_drives(monkeypatch, 3, runs_s=10)
+        line, drives, sims = che_drives(3, runs_s=10)
         with pytest.raises(KeyboardInterrupt), interrupted_at(nth, counts):
             fails_to_start_the_last(line, drives, sims)
         assert not any(sim.motor.goal for sim in sims), nth
@@ -200,7 +193,7 @@ def test_a_failed_staggered_start_stops_all_drives_although_one_stop_raises(
     def raises(*_: object) -> None:
         raise TypeError
 
-    line, drives, sims = che_drives(monkeypatch, 3, runs_s=10)
+    line, drives, sims = che_drives(3, runs_s=10)
     monkeypatch.setattr(threading, "Thread", NoThread)
     line.bus.stop_all()
     drives[0].begin_stop = raises
@@ -218,7 +211,7 @@ def test_a_failed_staggered_start_stops_all_drives_although_one_stop_raises(
 def test_a_stop_is_repeated_after_a_lack_of_memory_or_descriptors(
     monkeypatch: pytest.MonkeyPatch, fault: Exception, is_sent: bool
 ) -> None:
-    line, drives, sims = che_drives(monkeypatch, 2, runs_s=10)
+    line, drives, sims = che_drives(2, runs_s=10)
     carry_out, left = line.carry_out, [7]
 
     def failing(exchange: Exchange, **details: Any) -> Completion:
@@ -259,7 +252,7 @@ class NoRoom:
 def test_a_stop_is_created_as_soon_as_the_system_has_memory_and_descriptors(
     monkeypatch: pytest.MonkeyPatch, fault: Exception, all_of_them: bool
 ) -> None:
-    line, drives, sims = che_drives(monkeypatch, runs_s=10)
+    line, drives, sims = che_drives(runs_s=10)
     begun = line.seconds
     room = NoRoom(monkeypatch, 149, fault)
     line.bus.stop_all() if all_of_them else drives[0].stop()
@@ -271,7 +264,7 @@ def test_a_stop_is_created_as_soon_as_the_system_has_memory_and_descriptors(
 def test_a_stop_that_cannot_be_created_raises_memory_error_after_30_s(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    line, drives, _ = che_drives(monkeypatch, runs_s=10)
+    line, drives, _ = che_drives(runs_s=10)
     begun, before = line.seconds, len(line.written)
     NoRoom(monkeypatch, 1000, NO_MEMORY)
     with pytest.raises(MemoryError):
@@ -283,7 +276,7 @@ def test_a_stop_that_cannot_be_created_raises_memory_error_after_30_s(
 def test_the_error_of_a_stop_without_system_resources_names_the_reason(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    line, _, _ = che_drives(monkeypatch, runs_s=10)
+    line, _, _ = che_drives(runs_s=10)
 
     def failing(exchange: Exchange, **details: Any) -> Completion:
         raise NO_DESCRIPTORS
@@ -300,8 +293,8 @@ def test_the_error_of_a_stop_without_system_resources_names_the_reason(
 
 
 @pytest.mark.parametrize("seconds", [Decimal(12), Fraction(12), 10**400], ids=["decimal", "fraction", "huge"])
-def test_a_stop_accepts_any_number_type_for_seconds(monkeypatch: pytest.MonkeyPatch, seconds: Any) -> None:
-    line, drives, sims = che_drives(monkeypatch, runs_s=10)
+def test_a_stop_accepts_any_number_type_for_seconds(seconds: Any) -> None:
+    line, drives, sims = che_drives(runs_s=10)
     deaf_until = line.seconds + (20 if seconds == 12 else 2 * LEAST_S)
     line.deafens = lambda request: clock.now_ns() < deaf_until * 1e9
     if seconds == 12:
@@ -321,7 +314,7 @@ def test_a_repeated_stop_tries_to_open_a_locked_ledger_only_once(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     ledger = Ledger(tmp_path / "wear")
-    line = SimulatedBus(monkeypatch, simulated(Fan(1)), simulated(Fan(2)), ledger=ledger)
+    line = SimulatedBus(simulated(Fan(1)), simulated(Fan(2)), ledger=ledger)
     for address in (1, 2):
         line.attach(Fan(address))
     asked = 0
@@ -347,9 +340,9 @@ def test_a_repeated_stop_tries_to_open_a_locked_ledger_only_once(
 
 
 def test_a_stop_is_sent_although_the_port_name_is_not_text(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    line = SimulatedBus(monkeypatch, simulated(Fan(1)), ledger=tmp_path / "wear")
+    line = SimulatedBus(simulated(Fan(1)), ledger=tmp_path / "wear")
     line.identity = "/dev/tty\udcff"
     line.attach(Fan(1)).stop()
     assert len(line.written) == 1
@@ -398,9 +391,9 @@ def _unbounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(WriteRecords, "count", lambda *_: None)
 
 
-def running_family(monkeypatch: pytest.MonkeyPatch, family: str) -> tuple[SimulatedBus, Drive, MotorDrive]:
+def running_family(family: str) -> tuple[SimulatedBus, Drive, MotorDrive]:
     """Return a simulated bus, its drive, and the simulation, whose motor turns."""
-    line, drive, sim = one(monkeypatch, FAMILIES[family](1))
+    line, drive, sim = one(FAMILIES[family](1))
     sim.motor.acceleration_time = sim.motor.deceleration_time = 1.0
     drive.set_frequency(20)
     drive.start()
@@ -410,12 +403,12 @@ def running_family(monkeypatch: pytest.MonkeyPatch, family: str) -> tuple[Simula
     return line, drive, sim
 
 
-def check_stops(monkeypatch: pytest.MonkeyPatch, family: str, failure: str, step: int) -> None:
+def check_stops(family: str, failure: str, step: int) -> None:
     """Raise this failure at one line of the stop after another, `step` lines apart; check each time that the
     motor stops.
     """
     for nth in count(1, step):
-        line, drive, sim = running_family(monkeypatch, family)
+        line, drive, sim = running_family(family)
         told = ""
         try:
             with failing_at(nth, counts, FAILURES[failure]()) as place:
@@ -437,8 +430,6 @@ def check_stops(monkeypatch: pytest.MonkeyPatch, family: str, failure: str, step
 @pytest.mark.usefixtures("_unbounded")
 @pytest.mark.parametrize("step", first_in_ci(37, 11))
 @pytest.mark.parametrize(("family", "failure"), in_turn(FAMILIES, [*FAILURES]))
-def test_a_motor_is_stopped_although_its_stop_fails_at_any_line(
-    monkeypatch: pytest.MonkeyPatch, family: str, failure: str, step: int
-) -> None:
+def test_a_motor_is_stopped_although_its_stop_fails_at_any_line(family: str, failure: str, step: int) -> None:
     """Steps are prime, so that they reach different lines of loops. With step 1, a run takes 15 minutes."""
-    check_stops(monkeypatch, family, failure, step)
+    check_stops(family, failure, step)

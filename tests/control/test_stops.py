@@ -52,14 +52,10 @@ EACH_AND_EACH = [
 
 
 @pytest.mark.parametrize(("model", "act"), EACH_AND_EACH)
-def test_a_stop_called_at_any_frame_of_a_start_wins(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, model: str, act: str
-) -> None:
+def test_a_stop_called_at_any_frame_of_a_start_wins(tmp_path: Path, model: str, act: str) -> None:
     """A start that was sent is followed by the stop, and is never reported as unsent."""
     for frames in range(1, 100):
-        line, drive, meanwhile, begun, failure = started_while(
-            monkeypatch, tmp_path, model, frames, ACTS[act]
-        )
+        line, drive, meanwhile, begun, failure = started_while(tmp_path, model, frames, ACTS[act])
         if not meanwhile.has_come:
             break
         assert meanwhile.failure is None
@@ -76,24 +72,22 @@ def test_a_stop_called_at_any_frame_of_a_start_wins(
 
 @pytest.mark.parametrize("verb_name", ["coast", "emergency_stop"])
 @every_family
-def test_coast_and_emergency_stop_also_cancel_a_start(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, model: str, verb_name: str
-) -> None:
+def test_coast_and_emergency_stop_also_cancel_a_start(tmp_path: Path, model: str, verb_name: str) -> None:
     if getattr(type(MAKE[model](1)), verb_name) is getattr(Drive, verb_name):
         return
 
     def act(line: SimulatedBus, drive: Any) -> None:
         getattr(drive, verb_name)()
 
-    line, _, _, begun, failure = started_while(monkeypatch, tmp_path, model, 1, act)
+    line, _, _, begun, failure = started_while(tmp_path, model, 1, act)
     assert isinstance(failure, CancelledByStop)
     assert "a stop was called; nothing more was sent" in str(failure)
     assert first(line, begun, STARTS[model]) is None
 
 
-def test_a_stop_does_not_delay_other_drives(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_does_not_delay_other_drives() -> None:
     sims: list[Any] = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2)]
-    line = SimulatedBus(monkeypatch, *sims)
+    line = SimulatedBus(*sims)
     one_of_them, other = (line.attach(sim.drive) for sim in sims)
     other.set_frequency(20)
     Meanwhile(line, 2, one_of_them.stop)
@@ -101,8 +95,8 @@ def test_a_stop_does_not_delay_other_drives(monkeypatch: pytest.MonkeyPatch) -> 
     assert sims[1].motor.energised
 
 
-def test_a_start_during_a_stop_is_not_sent(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, (drive,), (sim,) = che_drives(monkeypatch, runs_s=0)
+def test_a_start_during_a_stop_is_not_sent() -> None:
+    line, (drive,), (sim,) = che_drives(runs_s=0)
     begun = len(line.frames)
     meanwhile = Meanwhile(line, 2, drive.start)
     drive.stop()
@@ -111,8 +105,8 @@ def test_a_start_during_a_stop_is_not_sent(monkeypatch: pytest.MonkeyPatch) -> N
     assert not sim.motor.energised
 
 
-def test_a_stop_cancels_a_ramp_in_progress(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, _ = one(monkeypatch, YD1000(1))
+def test_a_stop_cancels_a_ramp_in_progress() -> None:
+    line, drive, _ = one(YD1000(1))
     drive.set_frequency(10)
     begun = len(line.frames)
     meanwhile = Meanwhile(line, 8, drive.stop)
@@ -127,7 +121,7 @@ def test_a_stop_cancels_a_ramp_in_progress(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_stop_all_cancels_a_staggered_start(monkeypatch: pytest.MonkeyPatch) -> None:
     """A stop between two starts prevents the second start."""
-    line, drives, sims = che_drives(monkeypatch, 2)
+    line, drives, sims = che_drives(2)
     perform = drives[1].perform
 
     def stop_meanwhile(script: Script[Any]) -> Any:
@@ -140,8 +134,8 @@ def test_stop_all_cancels_a_staggered_start(monkeypatch: pytest.MonkeyPatch) -> 
     assert not any(sim.motor.energised for sim in sims)
 
 
-def test_no_call_moves_a_motor_after_the_bus_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+def test_no_call_moves_a_motor_after_the_bus_is_closed() -> None:
+    line, drive, _ = one(InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(20)
     line.bus.close()
     begun = len(line.frames)
@@ -163,10 +157,10 @@ def test_no_call_moves_a_motor_after_the_bus_is_closed(monkeypatch: pytest.Monke
 @every_family
 @pytest.mark.parametrize("seconds", [None, 12.0])
 def test_the_stop_of_a_silent_drive_leaves_other_drives_more_than_half_of_the_lines_time(
-    monkeypatch: pytest.MonkeyPatch, model: str, seconds: float | None
+    model: str, seconds: float | None
 ) -> None:
     """Only the first frames of the stop are sent without delay. The total time of the stop stays the same."""
-    line, drive, _ = one(monkeypatch, MAKE[model](1))
+    line, drive, _ = one(MAKE[model](1))
     line.bus.check_identity(drive)
     sent: list[float] = []
 
@@ -187,10 +181,8 @@ def test_the_stop_of_a_silent_drive_leaves_other_drives_more_than_half_of_the_li
 
 
 @pytest.mark.slow
-def test_a_stop_ends_after_its_time_limit_and_the_error_states_its_progress(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    line, (drive,), _ = che_drives(monkeypatch, hz=50, runs_s=20)
+def test_a_stop_ends_after_its_time_limit_and_the_error_states_its_progress() -> None:
+    line, (drive,), _ = che_drives(hz=50, runs_s=20)
     begun = line.seconds
     with pytest.raises(Unconfirmed, match=r"it was not seen to stop within its 2 s"):
         drive.stop(seconds=2)
@@ -217,9 +209,9 @@ SENSELESS = [-1, float("nan"), float("-inf"), Decimal("sNaN"), True, "5", [5], 5
 @pytest.mark.parametrize("seconds", SENSELESS, ids=map(repr, SENSELESS))
 @pytest.mark.parametrize("stops", ["stop", "coast", "stop_all"])
 def test_an_invalid_stop_time_is_ignored_with_a_warning(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, stops: str, seconds: Any
+    caplog: pytest.LogCaptureFixture, stops: str, seconds: Any
 ) -> None:
-    line, (drive,), (sim,) = che_drives(monkeypatch, hz=50, runs_s=20)
+    line, (drive,), (sim,) = che_drives(hz=50, runs_s=20)
     deaf_until = line.seconds + LEAST_S - 5
     line.deafens = lambda request: line.seconds < deaf_until
     if stops == "stop_all":
@@ -234,10 +226,8 @@ def test_an_invalid_stop_time_is_ignored_with_a_warning(
     )
 
 
-def test_a_stop_with_wrong_arguments_is_sent_before_type_error_is_raised(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    line, drive, sim = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+def test_a_stop_with_wrong_arguments_is_sent_before_type_error_is_raised() -> None:
+    line, drive, sim = one(InvtCHE(1, maximum_frequency=50))
     stop: Any = drive.stop
     for wrong, options in (((5,), {}), ((), {"second": 5}), ((drive, 1), {"seconds": -1})):
         drive.set_frequency(50)
@@ -266,8 +256,8 @@ class Patient(Own):
         yield from read(self.speed)
 
 
-def test_a_stop_script_s_waits_are_cut_off_at_the_stop_s_time_limit(monkeypatch: pytest.MonkeyPatch) -> None:
-    line = SimulatedBus(monkeypatch, simulated(Patient(1)))
+def test_a_stop_script_s_waits_are_cut_off_at_the_stop_s_time_limit() -> None:
+    line = SimulatedBus(simulated(Patient(1)))
     drive = line.attach(Patient(1))
     begun = line.seconds
     with pytest.raises(Unconfirmed, match="it was not seen to stop within its 2 s"):
@@ -276,9 +266,9 @@ def test_a_stop_script_s_waits_are_cut_off_at_the_stop_s_time_limit(monkeypatch:
     assert len(line.written) == 1
 
 
-def test_stop_all_repeats_its_stops_for_the_given_seconds_only(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stop_all_repeats_its_stops_for_the_given_seconds_only() -> None:
     sims: list[Any] = [simulated(InvtCHE(1, maximum_frequency=50)), simulated(ErmanERG220(2))]
-    line = SimulatedBus(monkeypatch, *sims)
+    line = SimulatedBus(*sims)
     for sim in sims:
         drive = line.attach(sim.drive)
         drive.set_frequency(20)
@@ -294,9 +284,9 @@ def test_stop_all_repeats_its_stops_for_the_given_seconds_only(monkeypatch: pyte
     }
 
 
-def test_a_stop_that_waits_for_its_drive_does_not_delay_another_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_that_waits_for_its_drive_does_not_delay_another_stop() -> None:
     """The other motor ramps down and is read in the meantime."""
-    line, _, sims = che_drives(monkeypatch, 2, hz=50, runs_s=20)
+    line, _, sims = che_drives(2, hz=50, runs_s=20)
     ready_at = line.seconds + 3
     line.bus.peer(sims[0].drive).c.ready_ns = round(ready_at * 1e9)
     asked: list[tuple[int, float]] = []
@@ -312,8 +302,8 @@ def test_a_stop_that_waits_for_its_drive_does_not_delay_another_stop(monkeypatch
     assert of_others[0] < ready_at - 2 < ready_at <= rested[0] < ready_at + 0.5 < of_others[-1]
 
 
-def test_a_lost_read_is_not_repeated_before_the_stop_is_sent_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, _ = one(monkeypatch, YD1000(1))
+def test_a_lost_read_is_not_repeated_before_the_stop_is_sent_again() -> None:
+    line, drive, _ = one(YD1000(1))
     line.bus.check_identity(drive)
     begun = len(line.frames)
     line.loses = lambda request: not is_write(request) and len(line.frames) == begun + 2
@@ -323,7 +313,7 @@ def test_a_lost_read_is_not_repeated_before_the_stop_is_sent_again(monkeypatch: 
 
 def test_only_later_writes_of_a_stop_wait_for_late_replies(monkeypatch: pytest.MonkeyPatch) -> None:
     """Waiting lets a stop be confirmed if replies are late. It does not delay other drives' first stops."""
-    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    line, drive, _ = one(InvtCHE(1, maximum_frequency=50))
     line.bus.check_identity(drive)
     carry_out, waits = line.carry_out, list[float]()
 
@@ -339,11 +329,9 @@ def test_only_later_writes_of_a_stop_wait_for_late_replies(monkeypatch: pytest.M
 
 
 @pytest.mark.slow
-def test_the_repetition_and_the_end_of_a_stop_are_logged_once(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_the_repetition_and_the_end_of_a_stop_are_logged_once(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "multidrop.control")
-    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+    line, drive, _ = one(InvtCHE(1, maximum_frequency=50))
     deaf_until = line.seconds + 20
     line.deafens = lambda request: line.seconds < deaf_until
     drive.stop()
@@ -356,8 +344,8 @@ def test_the_repetition_and_the_end_of_a_stop_are_logged_once(
     assert ends[0].startswith("invt-che@1: stopped after 2")
 
 
-def test_an_emergency_stop_that_trips_the_drive_is_sent_only_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, sim = one(monkeypatch, YD1000(1))
+def test_an_emergency_stop_that_trips_the_drive_is_sent_only_once() -> None:
+    line, drive, sim = one(YD1000(1))
     drive.set_frequency(20)
     drive.start()
     begun = len(line.frames)
@@ -370,10 +358,8 @@ def test_an_emergency_stop_that_trips_the_drive_is_sent_only_once(monkeypatch: p
 
 
 @pytest.mark.parametrize("tended", [True, False])
-def test_a_stop_reopens_a_lost_port_unless_a_poller_does(
-    monkeypatch: pytest.MonkeyPatch, tended: bool
-) -> None:
-    line, (drive,), (sim,) = che_drives(monkeypatch, runs_s=0)
+def test_a_stop_reopens_a_lost_port_unless_a_poller_does(tended: bool) -> None:
+    line, (drive,), (sim,) = che_drives(runs_s=0)
     back_at = line.seconds + 5
     opened: list[float] = []
 
@@ -403,8 +389,8 @@ def test_a_stop_reopens_a_lost_port_unless_a_poller_does(
     assert all(later - earlier >= 0.5 for earlier, later in pairwise(opened))
 
 
-def test_a_stop_on_a_closed_port_raises_immediately(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+def test_a_stop_on_a_closed_port_raises_immediately() -> None:
+    line, drive, _ = one(InvtCHE(1, maximum_frequency=50))
 
     def closed(request: Message) -> bytes | None:
         raise LineError("hall", "it is closed")
@@ -420,10 +406,10 @@ def test_a_stop_on_a_closed_port_raises_immediately(monkeypatch: pytest.MonkeyPa
 
 
 def test_a_stop_is_sent_although_the_ledger_cannot_be_written(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     (tmp_path / "file").write_text("")
-    line = SimulatedBus(monkeypatch, simulated(Own(1)), simulated(Own(2)), ledger=tmp_path / "file" / "wear")
+    line = SimulatedBus(simulated(Own(1)), simulated(Own(2)), ledger=tmp_path / "file" / "wear")
     drives = [line.attach(Own(address)) for address in (1, 2)]
     drives[0].stop()
     assert len(writes(line)) == 1
@@ -434,9 +420,9 @@ def test_a_stop_is_sent_although_the_ledger_cannot_be_written(
     assert "stops were not counted" in caplog.text
 
 
-def test_a_stop_whose_reply_is_lost_is_sent_again_before_any_read(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_whose_reply_is_lost_is_sent_again_before_any_read() -> None:
     """Although the value could be read back, the stop is sent again first."""
-    line = SimulatedBus(monkeypatch, simulated(Own(1)))
+    line = SimulatedBus(simulated(Own(1)))
     drive = line.attach(Own(1))
     lost: list[Message] = []
 
@@ -454,11 +440,9 @@ def test_a_stop_whose_reply_is_lost_is_sent_again_before_any_read(monkeypatch: p
     assert asked[sent : sent + 3] == [True, True, True]
 
 
-def test_a_stop_is_sent_and_counted_although_the_eeprom_budget_is_spent(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_a_stop_is_sent_and_counted_although_the_eeprom_budget_is_spent(tmp_path: Path) -> None:
     ledger = Ledger(tmp_path / "wear", budget=1)
-    line = SimulatedBus(monkeypatch, simulated(Own(1)), ledger=ledger)
+    line = SimulatedBus(simulated(Own(1)), ledger=ledger)
     drive = line.attach(Own(1, confirmed=1))
     drive.start()
     for _ in range(3):
@@ -469,10 +453,10 @@ def test_a_stop_is_sent_and_counted_although_the_eeprom_budget_is_spent(
     assert wear.writes == 4
 
 
-def test_a_write_cancelled_by_a_stop_is_not_counted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_write_cancelled_by_a_stop_is_not_counted(tmp_path: Path) -> None:
     for frames in range(1, 100):
         ledger = Ledger(tmp_path / f"wear-{frames}")
-        line, drive, sim = one(monkeypatch, DelixiModbus(1), ledger=ledger)
+        line, drive, sim = one(DelixiModbus(1), ledger=ledger)
         meanwhile = Meanwhile(line, frames, lambda drive=drive: drive.stop())
         with suppress(CancelledByStop):
             drive.write(drive.frequency, 12.0)
@@ -484,7 +468,7 @@ def test_a_write_cancelled_by_a_stop_is_not_counted(monkeypatch: pytest.MonkeyPa
     assert frames > 2
 
 
-def test_stop_all_stops_other_drives_if_a_script_raises(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stop_all_stops_other_drives_if_a_script_raises() -> None:
     class Broken(Own):
         """A drive whose stop fails before it sends anything."""
 
@@ -503,7 +487,7 @@ def test_stop_all_stops_other_drives_if_a_script_raises(monkeypatch: pytest.Monk
             yield from write(self.run, 0)
             raise ZeroDivisionError("division by zero")
 
-    line = SimulatedBus(monkeypatch, *(simulated(Own(address)) for address in (1, 2, 3)))
+    line = SimulatedBus(*(simulated(Own(address)) for address in (1, 2, 3)))
     for drive in (Broken(1, name="broken"), Breaks(2, name="breaks"), Own(3, name="own")):
         line.attach(drive)
     found = line.bus.stop_all()
@@ -516,10 +500,8 @@ def test_stop_all_stops_other_drives_if_a_script_raises(monkeypatch: pytest.Monk
     assert "division by zero" in found["breaks"].why
 
 
-def test_a_stop_that_is_one_plain_write_is_repeated_until_the_drive_answers(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    line = SimulatedBus(monkeypatch, simulated(Own(1)))
+def test_a_stop_that_is_one_plain_write_is_repeated_until_the_drive_answers() -> None:
+    line = SimulatedBus(simulated(Own(1)))
     drive = line.attach(Own(1))
     line.deafens = lambda request: line.seconds < 1010
     drive.stop()
@@ -542,7 +524,7 @@ class Hanging(logging.Handler):
 
 def test_a_stop_is_sent_even_if_a_log_handler_hangs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The audit log and the EEPROM ledger hang too. The second drive's stop does not wait for them."""
-    line = SimulatedBus(monkeypatch, *(simulated(Own(number)) for number in (1, 2)), audit=tmp_path / "audit")
+    line = SimulatedBus(*(simulated(Own(number)) for number in (1, 2)), audit=tmp_path / "audit")
     first, second = (line.attach(Own(address)) for address in (1, 2))
     hangs, released = threading.Event(), threading.Event()
 
@@ -585,8 +567,8 @@ def noting(line: SimulatedBus) -> list[str]:
     return told
 
 
-def test_a_stop_reports_its_progress_while_the_motor_slows_down(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, _ = one(monkeypatch, YD1000(1))
+def test_a_stop_reports_its_progress_while_the_motor_slows_down() -> None:
+    line, drive, _ = one(YD1000(1))
     drive.set_frequency(20)
     drive.start()
     line.sleep(10)
@@ -599,8 +581,8 @@ def test_a_stop_reports_its_progress_while_the_motor_slows_down(monkeypatch: pyt
     assert line.bus.stops_under_way() == {}
 
 
-def test_a_stop_without_reply_is_reported_as_sent(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, _ = one(monkeypatch, YD1000(1))
+def test_a_stop_without_reply_is_reported_as_sent() -> None:
+    line, drive, _ = one(YD1000(1))
     told = noting(line)
     line.loses = is_write
     assert line.bus.stop_all(seconds=5)[drive.name].seen is Seen.SENT
@@ -612,8 +594,8 @@ def test_a_stop_without_reply_is_reported_as_sent(monkeypatch: pytest.MonkeyPatc
     assert "it is not known whether" in told[2]
 
 
-def test_a_finished_stop_is_no_longer_reported_as_in_progress(monkeypatch: pytest.MonkeyPatch) -> None:
-    line = SimulatedBus(monkeypatch, simulated(YD1000(1)), simulated(YD1000(2)))
+def test_a_finished_stop_is_no_longer_reported_as_in_progress() -> None:
+    line = SimulatedBus(simulated(YD1000(1)), simulated(YD1000(2)))
     names = [line.attach(sim.drive).name for sim in line.sims]
     line.loses = lambda request: request.address == 2
     under_way: list[set[str]] = []
@@ -628,8 +610,8 @@ def test_a_finished_stop_is_no_longer_reported_as_in_progress(monkeypatch: pytes
     assert under_way[-1] == {names[1]}
 
 
-def test_a_refused_stop_is_not_reported_as_unsent(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, _ = one(monkeypatch, InnovertIBD(1))
+def test_a_refused_stop_is_not_reported_as_unsent() -> None:
+    line, drive, _ = one(InnovertIBD(1))
     told: list[str] = []
 
     def refuse(request: Message) -> bytes | None:

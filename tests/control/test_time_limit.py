@@ -31,8 +31,8 @@ from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 
 
 @pytest.fixture
-def line(monkeypatch: pytest.MonkeyPatch) -> SimulatedBus:
-    found, _, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+def line() -> SimulatedBus:
+    found, _, _ = one(InvtCHE(1, maximum_frequency=50))
     found.bus.drives[0].set_frequency(10)  # so that later calls need no identity check
     return found
 
@@ -102,10 +102,10 @@ class Slow(Drive):
 
 @pytest.mark.parametrize(("before", "between", "sent"), [(0.1, 0.1, 2), (0.1, 5.0, 2), (0.9, 0.1, 0)])
 def test_no_verb_starts_after_the_time_limit_but_a_started_verb_continues(
-    monkeypatch: pytest.MonkeyPatch, before: float, between: float, sent: int
+    before: float, between: float, sent: int
 ) -> None:
     """Unlike the limit, the bus's own expiry does not count the time that a script waits."""
-    line = SimulatedBus(monkeypatch, simulated(Slow(1)))
+    line = SimulatedBus(simulated(Slow(1)))
     drive = line.bus.attach(Slow(1, confirmed=1))
     drive.before, drive.between = before, between
     with within(line, 0.8), nullcontext() if sent else pytest.raises(Expired):
@@ -157,8 +157,8 @@ def test_a_stop_called_by_the_limit_function_cancels_the_call(line: SimulatedBus
 
 
 @table("limit", [0.5, True, "1", None])
-def test_with_an_invalid_time_limit_only_a_stop_is_sent(monkeypatch: pytest.MonkeyPatch, limit: Any) -> None:
-    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=50))
+def test_with_an_invalid_time_limit_only_a_stop_is_sent(limit: Any) -> None:
+    line, drive, _ = one(InvtCHE(1, maximum_frequency=50))
     with written_before(limit):
         for call in (lambda: drive.set_frequency(20), drive.start):
             with pytest.raises(TypeError, match=r"must be a function that returns a time"):
@@ -171,13 +171,11 @@ def test_with_an_invalid_time_limit_only_a_stop_is_sent(monkeypatch: pytest.Monk
 # ---- a bus's own expiry ----
 
 
-def check_not_sent(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, model: str, hold_up: Callable[[SimulatedBus], None]
-) -> None:
+def check_not_sent(tmp_path: Path, model: str, hold_up: Callable[[SimulatedBus], None]) -> None:
     """Check that a start delayed at any of its reads is not sent."""
     for frames in range(1, 100):
         line, _, meanwhile, begun, failure = started_while(
-            monkeypatch, tmp_path, model, frames, lambda line, drive: hold_up(line)
+            tmp_path, model, frames, lambda line, drive: hold_up(line)
         )
         start = first(line, begun, STARTS[model])
         if not meanwhile.has_come or (start is not None and start < frames):
@@ -205,26 +203,22 @@ class Resting(Own):
 
 
 @table("model", MAKE)
-def test_a_start_delayed_during_its_checks_is_not_sent(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, model: str
-) -> None:
+def test_a_start_delayed_during_its_checks_is_not_sent(tmp_path: Path, model: str) -> None:
     """The process is suspended at each read, as by Ctrl-Z."""
-    check_not_sent(monkeypatch, tmp_path, model, lambda line: line.sleep(5))
+    check_not_sent(tmp_path, model, lambda line: line.sleep(5))
 
 
 @table("model", MAKE)
-def test_a_start_is_not_sent_if_the_computer_slept_during_its_checks(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, model: str
-) -> None:
+def test_a_start_is_not_sent_if_the_computer_slept_during_its_checks(tmp_path: Path, model: str) -> None:
     """CLOCK_MONOTONIC does not advance during sleep, so by that clock the start is not late."""
 
     def sleep_for_a_night(line: SimulatedBus) -> None:
         line.slept += 8 * 3600
 
-    check_not_sent(monkeypatch, tmp_path, model, sleep_for_a_night)
+    check_not_sent(tmp_path, model, sleep_for_a_night)
 
 
-def test_a_start_does_not_expire_because_of_slow_reads(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_start_does_not_expire_because_of_slow_reads() -> None:
     class Sleepy(Own):
         """A drive whose start waits and reads twenty times."""
 
@@ -236,17 +230,15 @@ def test_a_start_does_not_expire_because_of_slow_reads(monkeypatch: pytest.Monke
                 yield from read(self.speed)
             yield from write(self.ratio, 1)
 
-    line = SimulatedBus(monkeypatch, simulated(Sleepy(1)))
+    line = SimulatedBus(simulated(Sleepy(1)))
     line.attach(Sleepy(1, confirmed=1)).start()
     assert len(writes(line)) == 1
 
 
 @pytest.mark.parametrize(("more", "is_sent"), [(0.25, True), (0.35, False)])
-def test_a_start_does_not_expire_while_its_reads_take_their_allowed_time(
-    monkeypatch: pytest.MonkeyPatch, more: float, is_sent: bool
-) -> None:
+def test_a_start_does_not_expire_while_its_reads_take_their_allowed_time(more: float, is_sent: bool) -> None:
     """A read may take as long as its timeout, two silences and 64 characters together."""
-    line = SimulatedBus(monkeypatch, simulated(Looking(1)))
+    line = SimulatedBus(simulated(Looking(1)))
     drive = line.attach(Looking(1, confirmed=1, silence=0.1))
     line.bus.check_identity(drive)
     line.queue_time = drive.response_timeout + more - EXCHANGE_TIME
@@ -259,10 +251,8 @@ def test_a_start_does_not_expire_while_its_reads_take_their_allowed_time(
 
 
 @pytest.mark.parametrize(("waits", "is_sent"), [(5.9, True), (6.1, False)])
-def test_the_least_interval_of_a_drive_does_not_count_towards_expiry(
-    monkeypatch: pytest.MonkeyPatch, waits: float, is_sent: bool
-) -> None:
-    line = SimulatedBus(monkeypatch, simulated(Resting(1)))
+def test_the_least_interval_of_a_drive_does_not_count_towards_expiry(waits: float, is_sent: bool) -> None:
+    line = SimulatedBus(simulated(Resting(1)))
     drive = line.attach(Resting(1, confirmed=1))
     line.bus.check_identity(drive)
     line.queue_time = waits
@@ -274,9 +264,9 @@ def test_the_least_interval_of_a_drive_does_not_count_towards_expiry(
     assert len(line.written) == is_sent
 
 
-def test_a_verb_does_not_expire_because_of_slow_writes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_verb_does_not_expire_because_of_slow_writes() -> None:
     """A ramp has more writes than fit into the expiry of one call."""
-    line, drive, _ = one(monkeypatch, YD1000(1))
+    line, drive, _ = one(YD1000(1))
     drive.set_frequency(1)
     before = len(writes(line))
     ramp(drive, 51, rate=0.5, every=1)

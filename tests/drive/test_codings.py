@@ -171,18 +171,17 @@ def test_whole_number_written_to_a_drive_is_read_back_unchanged(
     family = declared(level=setting(7, "m", kept=Kept.RAM, **details))
     register = family.registers["level"]
     data = on_the_wire(number_format, order, raw)
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        sim = SimulatedDrive(family(1))
-        line = SimulatedBus(monkeypatch, sim)
-        drive = line.attach(family(1))
-        value = register.decode(raw)
-        if Fraction(value) == Fraction(raw) * Fraction(str(step)) + Fraction(str(offset)) or abs(raw) < 2**50:
-            outcome = drive.try_write(register, value)
-            assert (outcome.effect, outcome.held) == (Effect.DONE, value)
-            assert bytes.fromhex(line.written[-1])[-2 - len(data) : -2] == data
-        sim.memory.set_raw(register, int.from_bytes(most_significant_first(number_format, raw)))
-        assert sim.read(3, 7, len(data) // 2) == list(words_of(data))
-        assert drive.read(register) == value == sim["level"]
+    sim = SimulatedDrive(family(1))
+    line = SimulatedBus(sim)
+    drive = line.attach(family(1))
+    value = register.decode(raw)
+    if Fraction(value) == Fraction(raw) * Fraction(str(step)) + Fraction(str(offset)) or abs(raw) < 2**50:
+        outcome = drive.try_write(register, value)
+        assert (outcome.effect, outcome.held) == (Effect.DONE, value)
+        assert bytes.fromhex(line.written[-1])[-2 - len(data) : -2] == data
+    sim.memory.set_raw(register, int.from_bytes(most_significant_first(number_format, raw)))
+    assert sim.read(3, 7, len(data) // 2) == list(words_of(data))
+    assert drive.read(register) == value == sim["level"]
 
 
 @pytest.mark.parametrize("number_format", FLOATS)
@@ -197,14 +196,13 @@ def test_float_written_to_a_drive_is_read_back_unchanged(
     raw = data.draw(counts(number_format))
     family = declared(level=setting(7, "m", kept=Kept.RAM, number_format=number_format, order=order))
     register = family.registers["level"]
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        sim = SimulatedDrive(family(1))
-        line = SimulatedBus(monkeypatch, sim)
-        drive = line.attach(family(1))
-        assert drive.write(register, raw) == raw == sim["level"]
-        held = on_the_wire(number_format, order, raw or 0.0)  # -0.0 is stored as 0
-        assert sim.read(3, 7, len(held) // 2) == list(words_of(held))
-        assert register.encode(register.parse(register.format(raw).removesuffix(" m"))) == raw
+    sim = SimulatedDrive(family(1))
+    line = SimulatedBus(sim)
+    drive = line.attach(family(1))
+    assert drive.write(register, raw) == raw == sim["level"]
+    held = on_the_wire(number_format, order, raw or 0.0)  # -0.0 is stored as 0
+    assert sim.read(3, 7, len(held) // 2) == list(words_of(held))
+    assert register.encode(register.parse(register.format(raw).removesuffix(" m"))) == raw
 
 
 # ---- parts of a word ----
@@ -347,16 +345,14 @@ def test_an_invalid_raw_count_gives_no_value_in_every_number_format(
     assert register.value_in(other, 0) is not None
 
 
-def test_bus_raises_no_value_when_a_drive_returns_an_invalid_raw_count(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_bus_raises_no_value_when_a_drive_returns_an_invalid_raw_count() -> None:
     family = declared(
         level=reading(0, "m", invalid=0x7FFF),
         speed=reading(1, "rpm"),
         limit=setting(2, "m", invalid=0xFFFF, kept=Kept.EEPROM),
     )
     sim = SimulatedDrive(family(1))
-    line = SimulatedBus(monkeypatch, sim)
+    line = SimulatedBus(sim)
     drive = line.attach(family(1, name="tank"))
     sim["level"], sim["speed"], sim["limit"] = None, 20, None
     assert sim.read(3, 0, 3) == [0x7FFF, 20, 0xFFFF]

@@ -29,8 +29,8 @@ class Device(Drive):
 
 
 @pytest.fixture
-def meter(monkeypatch: pytest.MonkeyPatch) -> tuple[SimulatedBus, ModbusDevice]:
-    line = SimulatedBus(monkeypatch, SimulatedDrive(Device(7)))
+def meter() -> tuple[SimulatedBus, ModbusDevice]:
+    line = SimulatedBus(SimulatedDrive(Device(7)))
     return line, line.attach(ModbusDevice(7, name="meter"))
 
 
@@ -206,10 +206,10 @@ class Tank(Drive):
 
 
 @pytest.fixture
-def metered(monkeypatch: pytest.MonkeyPatch) -> tuple[SimulatedBus, Tank]:
+def metered() -> tuple[SimulatedBus, Tank]:
     sim = SimulatedDrive(Tank(1, name="tank"))
     sim["level"], sim["flow"], sim["limit"], sim["serial"] = 2.5, 7, 4.0, "AB12"
-    line = SimulatedBus(monkeypatch, sim)
+    line = SimulatedBus(sim)
     return line, line.attach(Tank(1, name="tank"))
 
 
@@ -259,7 +259,7 @@ def test_setting_is_written_by_its_name(metered: tuple[SimulatedBus, Tank]) -> N
         tank.write("limits", 6.5)
 
 
-def test_drive_without_a_bus_raises_not_attached(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_drive_without_a_bus_raises_not_attached() -> None:
     pump = InnovertIBD(1, name="pump-1")
     sentence = r"^pump-1 is not attached to a bus: use bus\.attach\(\.\.\.\)$"
     for call in (
@@ -273,7 +273,7 @@ def test_drive_without_a_bus_raises_not_attached(monkeypatch: pytest.MonkeyPatch
     ):
         with pytest.raises(NotAttached, match=sentence):
             call()
-    line, attached, _ = one(monkeypatch, InnovertIBD(1, name="pump-1"))
+    line, attached, _ = one(InnovertIBD(1, name="pump-1"))
     line.bus.detach(attached)
     with pytest.raises(NotAttached, match="pump-1 is not attached to this bus"):
         attached.read("output_current")

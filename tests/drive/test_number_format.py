@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
 from examples import examples
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from simulated_bus import SimulatedBus
+from simulated_bus import SimulatedBus, real_clock
 from tables import table
 
 from multidrop.cli.support.values import as_json, nearest_value, value_text
@@ -95,10 +96,10 @@ def test_written_number_has_the_bytes_of_its_number_format(
 
 
 @pytest.fixture(scope="module")
-def attached() -> Any:
-    with pytest.MonkeyPatch.context() as monkeypatch:
+def attached() -> Iterator[Any]:
+    with real_clock():
         sim = SimulatedDrive(Meter(1))
-        line = SimulatedBus(monkeypatch, sim)
+        line = SimulatedBus(sim)
         yield line, line.attach(Meter(1, confirmed=1)), sim
 
 
@@ -210,10 +211,10 @@ def test_register_of_several_words_is_read_without_a_stated_read_limit(attached:
 
 
 @pytest.mark.parametrize("order", [1, -1])
-def test_a_reading_and_a_command_may_share_an_address(monkeypatch: pytest.MonkeyPatch, order: int) -> None:
+def test_a_reading_and_a_command_may_share_an_address(order: int) -> None:
     declared = [("status", reading(5)), ("control", command(5, span=(0, 7), moves=False))][::order]
     both = type("Both", (Drive,), dict(declared))
-    line = SimulatedBus(monkeypatch, SimulatedDrive(both(1)))
+    line = SimulatedBus(SimulatedDrive(both(1)))
     drive = line.attach(both(1, confirmed=1))
     assert drive.write(drive.control, 3) == 3
     assert drive.read(drive.status) == 3

@@ -85,8 +85,8 @@ def written(line: SimulatedBus) -> list[str]:
     return [frame[:17] for frame in line.written]
 
 
-def test_write_to_a_setting_of_a_users_drive_needs_no_confirmation(monkeypatch: pytest.MonkeyPatch) -> None:
-    line = SimulatedBus(monkeypatch, simulated(Fan(1)))
+def test_write_to_a_setting_of_a_users_drive_needs_no_confirmation() -> None:
+    line = SimulatedBus(simulated(Fan(1)))
     fan = line.attach(Fan(1))
     assert fan.write(fan.frequency, 25.0) == 25.0
     assert "confirmed" not in Fan.options
@@ -94,10 +94,8 @@ def test_write_to_a_setting_of_a_users_drive_needs_no_confirmation(monkeypatch: 
 
 @table("confirmed", [0, 1])
 @table("word", Word)
-def test_plain_write_to_a_command_register_is_refused_by_default(
-    monkeypatch: pytest.MonkeyPatch, confirmed: int, word: Word
-) -> None:
-    line = SimulatedBus(monkeypatch, simulated(Pump(1)))
+def test_plain_write_to_a_command_register_is_refused_by_default(confirmed: int, word: Word) -> None:
+    line = SimulatedBus(simulated(Pump(1)))
     pump = line.attach(Pump(1, name="pump", confirmed=confirmed))
     with pytest.raises(WriteForbidden) as refusal:
         pump.write(pump.control, word)
@@ -108,14 +106,14 @@ def test_plain_write_to_a_command_register_is_refused_by_default(
     assert line.frames == []
 
 
-def test_error_for_a_missing_verb_names_the_method_to_declare(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_for_a_missing_verb_names_the_method_to_declare() -> None:
     class Bare(Drive):
         """A drive with a command, but without verbs."""
 
         level = reading(1)
         run = command(2)
 
-    line = SimulatedBus(monkeypatch, simulated(Bare(1)))
+    line = SimulatedBus(simulated(Bare(1)))
     bare = line.attach(Bare(1, confirmed=1))
     with pytest.raises(
         WriteForbidden, match=r"its class does not say .*: declare harmless = \(…\), moves = False, or"
@@ -124,15 +122,13 @@ def test_error_for_a_missing_verb_names_the_method_to_declare(monkeypatch: pytes
     assert line.frames == []
 
 
-def test_write_of_a_raw_count_declared_harmless_needs_no_confirmation(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_write_of_a_raw_count_declared_harmless_needs_no_confirmation() -> None:
     class Stoppable(Pump):
         """A drive whose control word has a stop that is declared harmless."""
 
         control = command(0x30, Word, harmless=(Word.STOP,))
 
-    line = SimulatedBus(monkeypatch, simulated(Stoppable(1)))
+    line = SimulatedBus(simulated(Stoppable(1)))
     pump = line.attach(Stoppable(1))
     pump.write(pump.control, Word.STOP)
     with pytest.raises(WriteForbidden, match="RUN commands the motor"):
@@ -141,9 +137,7 @@ def test_write_of_a_raw_count_declared_harmless_needs_no_confirmation(
 
 
 @pytest.mark.parametrize("name", ["start", "set_frequency", "target"])
-def test_start_of_a_drive_without_identify_needs_confirmation(
-    monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
+def test_start_of_a_drive_without_identify_needs_confirmation(name: str) -> None:
     def command_it(line: SimulatedBus, pump: Pump) -> None:
         acts = {
             "start": pump.start,
@@ -152,7 +146,7 @@ def test_start_of_a_drive_without_identify_needs_confirmation(
         }
         acts[name]()
 
-    line = SimulatedBus(monkeypatch, simulated(Pump(1)))
+    line = SimulatedBus(simulated(Pump(1)))
     pump = line.attach(Pump(1, name="pump"))
     with pytest.raises(WriteForbidden) as refusal:
         command_it(line, pump)
@@ -167,7 +161,7 @@ def test_start_of_a_drive_without_identify_needs_confirmation(
 
 
 @pytest.mark.parametrize("name", ["start_staggered", "ramp", "run_at"])
-def test_ramps_and_combined_verbs_need_confirmation_too(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+def test_ramps_and_combined_verbs_need_confirmation_too(name: str) -> None:
     class Combined(Pump):
         """A drive with a verb that combines two others."""
 
@@ -188,7 +182,7 @@ def test_ramps_and_combined_verbs_need_confirmation_too(monkeypatch: pytest.Monk
         pump.commanded = 10.0
         acts[name]()
 
-    line = SimulatedBus(monkeypatch, simulated(Combined(1)))
+    line = SimulatedBus(simulated(Combined(1)))
     pump = line.attach(Combined(1, name="pump"))
     with pytest.raises(WriteForbidden, match=r"is not sent to pump: .*declare confirmed = 1"):
         command_it(pump)
@@ -199,18 +193,16 @@ def test_ramps_and_combined_verbs_need_confirmation_too(monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize("name", ["stop", "coast", "stop_all"])
-def test_stop_of_a_drive_without_identify_needs_no_confirmation(
-    monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
-    line = SimulatedBus(monkeypatch, simulated(Pump(1)))
+def test_stop_of_a_drive_without_identify_needs_no_confirmation(name: str) -> None:
+    line = SimulatedBus(simulated(Pump(1)))
     pump = line.attach(Pump(1))
     getattr(line.bus if name == "stop_all" else pump, name)()
     assert written(line) == [STOP]
 
 
-def test_start_of_a_drive_with_identify_needs_no_confirmation(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_start_of_a_drive_with_identify_needs_no_confirmation() -> None:
     assert "confirmed" in Pump.options
-    line = SimulatedBus(monkeypatch, simulated(Known(1)))
+    line = SimulatedBus(simulated(Known(1)))
     line.attach(Known(1)).start()
     assert written(line) == [RUN]
 
@@ -220,9 +212,9 @@ def acknowledged(request: Message) -> bytes | None:
     return bytes.fromhex("01 86 05 82 63") if request.function == 6 else None  # checksum computed by pymodbus
 
 
-def test_write_that_is_answered_with_exception_05_is_unconfirmed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_write_that_is_answered_with_exception_05_is_unconfirmed() -> None:
     """Exception 05 means: accepted and being processed (application protocol V1.1b3, section 7)."""
-    line = SimulatedBus(monkeypatch, simulated(Known(1)))
+    line = SimulatedBus(simulated(Known(1)))
     drive = line.attach(Known(1))
     line.answers = acknowledged
     with pytest.raises(Unconfirmed, match="its reply is code 05H, acknowledged, still working"):
@@ -230,29 +222,27 @@ def test_write_that_is_answered_with_exception_05_is_unconfirmed(monkeypatch: py
     assert written(line) == [RUN]
 
 
-def test_exception_05_is_a_refusal_if_the_family_gives_it_another_meaning(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_exception_05_is_a_refusal_if_the_family_gives_it_another_meaning() -> None:
     class Locked(Known):
         """A drive whose manual defines exception 05 differently."""
 
         exceptions: ClassVar = {5: "locked by its password"}
 
-    line = SimulatedBus(monkeypatch, simulated(Locked(1)))
+    line = SimulatedBus(simulated(Locked(1)))
     drive = line.attach(Locked(1))
     line.answers = acknowledged
     with pytest.raises(DriveException, match="code 05H, locked by its password"):
         drive.start()
 
 
-def test_setting_can_be_declared_to_move_the_motor(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_setting_can_be_declared_to_move_the_motor() -> None:
     class Readable(Drive):
         """A drive whose control word can be read."""
 
         control = setting(1, Word, moves=True, harmless=(Word.STOP,), kept=Kept.RAM)
         mode = setting(2, moves=True, kept=Kept.RAM)
 
-    line = SimulatedBus(monkeypatch, simulated(Readable(1)))
+    line = SimulatedBus(simulated(Readable(1)))
     drive = line.attach(Readable(1, confirmed=1))
     for register, value in ((drive.control, Word.RUN), (drive.mode, 1)):
         with pytest.raises(WriteForbidden, match="commands the motor"):

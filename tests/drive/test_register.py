@@ -350,14 +350,13 @@ def test_strings_from_text_registers_have_no_control_characters(data: bytes) -> 
 @given(st.text(st.characters(min_codepoint=33, max_codepoint=126), max_size=6))
 @pytest.mark.parametrize("declared", [Meter.serial, Meter.maker], ids=str)
 def test_text_register_of_a_simulated_drive_is_read_over_the_line(declared: Text, value: str) -> None:
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        sim = SimulatedDrive(Meter(1))
-        line = SimulatedBus(monkeypatch, sim)
-        drive = line.attach(Meter(1))
-        sim[declared.name] = value
-        assert drive.read(declared) == value == sim[declared.name]
-        counts = [request.count for request, _ in line.frames]
-        assert counts == ([5, 5, 2] if declared is Meter.serial else [3])
+    sim = SimulatedDrive(Meter(1))
+    line = SimulatedBus(sim)
+    drive = line.attach(Meter(1))
+    sim[declared.name] = value
+    assert drive.read(declared) == value == sim[declared.name]
+    counts = [request.count for request, _ in line.frames]
+    assert counts == ([5, 5, 2] if declared is Meter.serial else [3])
 
 
 class Known(Meter):
@@ -373,10 +372,10 @@ class Known(Meter):
 
 
 @pytest.mark.parametrize("maker", ["ABB", "ABC"])
-def test_identify_of_a_drive_can_read_a_text_register(monkeypatch: pytest.MonkeyPatch, maker: str) -> None:
+def test_identify_of_a_drive_can_read_a_text_register(maker: str) -> None:
     sim = SimulatedDrive(Known(1))
     sim["maker"] = maker
-    line = SimulatedBus(monkeypatch, sim)
+    line = SimulatedBus(sim)
     drive = line.attach(Known(1, name="em-1"))
     if maker == "ABB":
         assert drive.write(drive.limit, 3) == 3
@@ -398,15 +397,13 @@ def test_scan_reads_text_registers_to_identify_families() -> None:
     assert _read(Known(1), Known.maker, ask) == "ABB"
 
 
-def test_polling_a_text_or_reading_another_familys_text_raises_an_error(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_polling_a_text_or_reading_another_familys_text_raises_an_error() -> None:
     class Other(Drive):
         """Another family with a text register at the same address."""
 
         serial = text(20, 12)
 
-    line = SimulatedBus(monkeypatch, SimulatedDrive(Meter(1)))
+    line = SimulatedBus(SimulatedDrive(Meter(1)))
     drive = line.attach(Meter(1, name="em-1"))
     assert [register.name for register in Meter.readings()] == ["level"]
     assert list(Meter.texts) == ["serial", "maker"]

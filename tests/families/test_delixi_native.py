@@ -278,11 +278,9 @@ def test_table_of_a_delixi_parameter_selects_ram_or_eeprom() -> None:
         setting(parameter(0, 17), "s", table=PARAMETER, kept=Kept.RAM)
 
 
-def test_only_delixi_writes_to_eeprom_are_counted_and_limited(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_only_delixi_writes_to_eeprom_are_counted_and_limited(tmp_path: Path) -> None:
     ledger = Ledger(tmp_path / "wear", budget=1000)
-    line, drive, sim = one(monkeypatch, Owned(1), ledger=ledger)
+    line, drive, sim = one(Owned(1), ledger=ledger)
     for seconds in (1.0, 2.0, 3.0):
         drive.write(drive.ramp, seconds)
     assert ledger.wear(line.seconds) == []

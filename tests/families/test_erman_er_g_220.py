@@ -329,9 +329,9 @@ def test_erman_identify_refuses_the_models_03_and_04() -> None:
         Wire(ErmanERG220(1), {"status": NoReply("drive")}).drive.identify()
 
 
-def test_erman_coils_are_read_within_one_byte_and_only_on_request(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_erman_coils_are_read_within_one_byte_and_only_on_request() -> None:
     """The order of two bytes in a reply is doubtful (section 6, the example of function 01)."""
-    line, drive, _ = one(monkeypatch, ErmanERG220(1))
+    line, drive, _ = one(ErmanERG220(1))
     coils = [drive.start_held, drive.stop_held, drive.emergency_stop_held, drive.fault_reset_held]
     assert not set(coils) & set(drive.readings())
     held = drive.read_many(coils)
@@ -351,9 +351,9 @@ def test_erman_coils_are_read_within_one_byte_and_only_on_request(monkeypatch: p
             drive.write(register, Coil.ON)
 
 
-def test_erman_diagnostics_request_can_be_sent_with_send_raw(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_erman_diagnostics_request_can_be_sent_with_send_raw() -> None:
     """`send_raw` sends function 08 (section 8). The misprinted error reply counts as a refusal too."""
-    line, drive, _ = one(monkeypatch, ErmanERG220(1))
+    line, drive, _ = one(ErmanERG220(1))
     assert drive.send_raw(0x08, 0x0000, b"\xa5\x37") == b"\xa5\x37"
     asked, read = (frame for _, frame in line.frames)
     assert asked == "01 08 00 00 A5 37 DA 8D"

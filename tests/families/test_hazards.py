@@ -336,10 +336,8 @@ class Mine(InvtCHE):
 
 
 @pytest.mark.parametrize("hazard", HAZARDS.values(), ids=HAZARDS)
-def test_dangerous_action_sends_only_the_safe_frames_or_is_refused(
-    monkeypatch: pytest.MonkeyPatch, hazard: Hazard
-) -> None:
-    line, drive, sim = one(monkeypatch, hazard.drive())
+def test_dangerous_action_sends_only_the_safe_frames_or_is_refused(hazard: Hazard) -> None:
+    line, drive, sim = one(hazard.drive())
     for name, value in hazard.shows.items():
         sim[name] = value
     if hazard.turning:
@@ -360,8 +358,8 @@ def body(frame: str) -> str:
     return frame[:-2] if frame.startswith(":") else frame[:-6]
 
 
-def test_low_byte_of_a_yd1000_checksum_is_sent_first_erratum_y2(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, sim = one(monkeypatch, YD1000(1))
+def test_low_byte_of_a_yd1000_checksum_is_sent_first_erratum_y2() -> None:
+    line, drive, sim = one(YD1000(1))
     run(line, drive, sim)
     assert line.written[-1] == "01 06 10 00 C4 00 DF CA"
 
@@ -373,17 +371,15 @@ def reply_to(request: Message, frame: str) -> tuple[int, Message | None]:
     return parse_reply(Framing.RTU, bytes.fromhex(frame), request)
 
 
-def test_erman_checksum_is_computed_not_copied_from_the_example_erratum_e1(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    line, drive, _ = one(monkeypatch, ErmanERG220(1))
+def test_erman_checksum_is_computed_not_copied_from_the_example_erratum_e1() -> None:
+    line, drive, _ = one(ErmanERG220(1))
     drive.read(drive.output_frequency, drive.output_current, drive.dc_bus_voltage)
     assert [frame for _, frame in line.frames] == ["01 04 00 01 00 05 61 C9"]
 
 
-def test_erman_reply_with_another_byte_count_is_rejected_erratum_e2(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_erman_reply_with_another_byte_count_is_rejected_erratum_e2() -> None:
     printed = "01 04 10 01 F4 00 00 00 D6 00 00 02 32 0A 03"
-    line, drive, _ = one(monkeypatch, ErmanERG220(1))
+    line, drive, _ = one(ErmanERG220(1))
     line.answers = lambda request: bytes.fromhex(printed)
     with pytest.raises(BadReply):
         drive.read(drive.output_frequency, drive.output_current, drive.dc_bus_voltage)
@@ -408,17 +404,17 @@ def test_erman_diagnostics_and_unknown_addresses_are_not_used_erratum_e13_e16() 
     )
 
 
-def test_request_refused_as_damaged_by_a_che_is_repeated_erratum_i4(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, _ = one(monkeypatch, InvtCHE(1))
+def test_request_refused_as_damaged_by_a_che_is_repeated_erratum_i4() -> None:
+    line, drive, _ = one(InvtCHE(1))
     damaged = build_reply(Framing.RTU, Message(1, 3, exception=0x11))
     line.answers = lambda request: damaged if len(line.frames) == 1 else None
     assert drive.read(drive.output_frequency) == 0
     assert len(line.frames) == 2
 
 
-def test_erman_identify_refuses_the_models_03_and_04_erratum_i2_e(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_erman_identify_refuses_the_models_03_and_04_erratum_i2_e() -> None:
     """These models lack function 04; the exception makes `identify` refuse them."""
-    line, drive, _ = one(monkeypatch, ErmanERG220(1))
+    line, drive, _ = one(ErmanERG220(1))
     refusal = build_reply(Framing.RTU, Message(1, 4, exception=1))
     line.answers = lambda request: refusal if request.function == 4 else None
     with pytest.raises(WriteForbidden, match="not an ER-G-220"):
@@ -453,27 +449,21 @@ def test_unexplained_example_of_the_che_manual_cannot_be_sent_erratum_i6() -> No
     assert not [register for register in InvtCHE.registers.values() if register.address == 0x0008]
 
 
-def test_at_most_four_innovert_ibd_registers_are_read_at_once_erratum_n3_n6(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    line, drive, _ = one(monkeypatch, InnovertIBD(1))
+def test_at_most_four_innovert_ibd_registers_are_read_at_once_erratum_n3_n6() -> None:
+    line, drive, _ = one(InnovertIBD(1))
     drive.read_many([register for register in drive.registers.values() if register.readable])
     assert max(request.count for request, _ in line.frames) <= 4
     assert reply_to(Message(1, 3, 0x16, 1), "01 03 02 18 00 B2 44")[1] is not None
 
 
-def test_innovert_ibd_with_unprogrammed_outputs_never_reports_stopped_erratum_n9(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    _, drive, sim = one(monkeypatch, InnovertIBD(1))
+def test_innovert_ibd_with_unprogrammed_outputs_never_reports_stopped_erratum_n9() -> None:
+    _, drive, sim = one(InnovertIBD(1))
     sim["output_m01"] = 0
     assert drive.state().condition is Condition.UNKNOWN
 
 
-def test_delixi_states_2_and_3_are_running_and_a_changed_copy_is_rejected_erratum_d2_d15(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    _, drive, sim = one(monkeypatch, DelixiNative(1))
+def test_delixi_states_2_and_3_are_running_and_a_changed_copy_is_rejected_erratum_d2_d15() -> None:
+    _, drive, sim = one(DelixiNative(1))
     sim["status"] = DelixiNativeStatus.FORWARD
     assert drive.state().condition is Condition.RUNNING
     request = Message(1, 4, 1, data=b"\0\0\x13\x88")
@@ -497,9 +487,9 @@ def test_delixi_fault_04_is_decoded_as_ou_erratum_d8() -> None:
 
 
 @pytest.mark.parametrize("code", [1, 2, 0x42])
-def test_any_exception_code_is_a_refusal_erratum_d13_y15(monkeypatch: pytest.MonkeyPatch, code: int) -> None:
+def test_any_exception_code_is_a_refusal_erratum_d13_y15(code: int) -> None:
     for make in (delixi, yd):
-        line, drive, _ = one(monkeypatch, make())
+        line, drive, _ = one(make())
         refusal = build_reply(Framing.RTU, Message(1, 3, exception=code))
         line.answers = lambda request, refusal=refusal: refusal
         with pytest.raises(DriveException) as raised:
@@ -527,8 +517,8 @@ def test_yd1000_frame_lengths_follow_from_their_fields_erratum_y3_y4() -> None:
     assert (used, reply and reply.data) == (7, b"\x13\x88")
 
 
-def test_frozen_yd1000_status_is_not_reported_as_running_erratum_y8(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, sim = one(monkeypatch, YD1000(1))
+def test_frozen_yd1000_status_is_not_reported_as_running_erratum_y8() -> None:
+    line, drive, sim = one(YD1000(1))
     run(line, drive, sim)
     line.sleep(2)
     drive.state()
@@ -539,8 +529,8 @@ def test_frozen_yd1000_status_is_not_reported_as_running_erratum_y8(monkeypatch:
     drive.stop()
 
 
-def test_yd1000_watchdog_setting_is_readable_erratum_y12(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, sim = one(monkeypatch, YD1000(1))
+def test_yd1000_watchdog_setting_is_readable_erratum_y12() -> None:
+    line, drive, sim = one(YD1000(1))
     assert "off" in line.bus.watchdog(drive)
     sim["communication_timeout"] = 7
     assert "7 s" in line.bus.watchdog(drive)
@@ -557,9 +547,9 @@ def test_registers_kept_in_eeprom_are_declared_as_eeprom_erratum_0_8() -> None:
 # ---- adapters with an echo ----
 
 
-def test_echo_of_an_adapter_is_not_accepted_as_a_drive_erratum_0_3(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_echo_of_an_adapter_is_not_accepted_as_a_drive_erratum_0_3() -> None:
     """If only copies of the requests arrive, no read gets a valid reply, and no write is sent."""
-    line = SimulatedBus(monkeypatch)
+    line = SimulatedBus()
     drives = [line.attach(make) for make in (InvtCHE(1, maximum_frequency=50), ErmanERG220(2), YD1000(3))]
     for drive in drives:
         for script in (drive.set_frequency.script(20), drive.start.script(), drive.reset_fault.script()):

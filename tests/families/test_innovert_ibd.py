@@ -183,8 +183,8 @@ def test_innovert_ibd_start_and_jog_of_a_turning_motor_are_refused(turning: dict
     assert wire.sent == [FIFTY[Framing.RTU]]
 
 
-def test_innovert_ibd_start_after_jog_and_stop_runs_at_the_setpoint(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, sim = one(monkeypatch, InnovertIBD(1))
+def test_innovert_ibd_start_after_jog_and_stop_runs_at_the_setpoint() -> None:
+    line, drive, sim = one(InnovertIBD(1))
     drive.jog()
     drive.set_frequency(50)
     with pytest.raises(WriteForbidden, match=r"stop\(\) first"):

@@ -302,10 +302,8 @@ def test_che_setpoint_is_written_in_percent_of_the_maximum_frequency() -> None:
 
 
 @table(("most", "hz", "count"), [(50, 20.03, 4006), (30, 10, 3333), (60, 40, 6667), (60, 60, 10000)])
-def test_che_setpoint_is_rounded_to_a_hundredth_of_a_percent(
-    monkeypatch: pytest.MonkeyPatch, most: float, hz: float, count: int
-) -> None:
-    line, drive, _ = one(monkeypatch, InvtCHE(1, maximum_frequency=most))
+def test_che_setpoint_is_rounded_to_a_hundredth_of_a_percent(most: float, hz: float, count: int) -> None:
+    line, drive, _ = one(InvtCHE(1, maximum_frequency=most))
     drive.set_frequency(hz)
     (written,) = line.written
     assert int(written[12:17].replace(" ", ""), 16) == count
@@ -359,9 +357,7 @@ def test_che_parameter_of_a_user_is_written_to_its_ram_address() -> None:
             parameter(wrong)
 
 
-def test_che_stored_parameter_is_written_to_eeprom_and_counted(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_che_stored_parameter_is_written_to_eeprom_and_counted(tmp_path: Path) -> None:
     """The frame is the example of section 11.6.2, which does not explain its value."""
 
     class Mine(InvtCHE):
@@ -374,7 +370,7 @@ def test_che_stored_parameter_is_written_to_eeprom_and_counted(
     with pytest.raises(ValueError, match="0 to 511"):
         stored_parameter(512)
     ledger = Ledger(tmp_path / "wear", budget=100)
-    line, drive, sim = one(monkeypatch, Mine(2), ledger=ledger)
+    line, drive, sim = one(Mine(2), ledger=ledger)
     drive.write(drive.ramp, 3.0)
     assert ledger.wear(line.seconds) == []
     drive.write(drive.jump, 0x1388)

@@ -386,10 +386,10 @@ def made(name: str) -> Drive:
     return find_model(name)(1, **({"maximum_frequency": 50} if name == "invt-che" else {}))
 
 
-def connected(monkeypatch: pytest.MonkeyPatch, name: str) -> tuple[Any, Responder]:
+def connected(name: str) -> tuple[Any, Responder]:
     """Return a drive on a bus, and the responder that receives its frames."""
     there = Responder(SHEETS[name])
-    line = SimulatedBus(monkeypatch)
+    line = SimulatedBus()
 
     def answer(request: object) -> bytes:
         sent = line.frames[-1][1]
@@ -411,56 +411,53 @@ def test_each_of_the_25_families_has_a_responder() -> None:
 @table("name", COMMANDED)
 def test_start_stop_and_reset_send_the_documented_words_and_values_match(name: str) -> None:
     sheet = SHEETS[name]
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        driven, there = connected(monkeypatch, name)
-        assert driven.state().condition is sheet.standing
-        driven.set_frequency(20)
-        driven.start()
-        assert driven.state().condition is Condition.RUNNING
-        assert values(driven, sheet.shown) == pytest.approx(sheet.shown, abs=0.005)
-        driven.stop()
-        assert driven.state().condition is sheet.standing
-        assert there.words == [sheet.setpoint, *sheet.starts, *sheet.stops]
-        there.memory |= sheet.tripped
-        assert driven.state().condition is sheet.failed
-        there.words.clear()
-        if sheet.reset is None:
-            with pytest.raises(Unsupported):
-                driven.reset_fault()
-            return
-        driven.reset_fault()
-        before = sheet.stops if sheet.before_reset is None else sheet.before_reset
-        assert there.words == [*before, sheet.reset, *sheet.after_reset]  # any other word could run the motor
-        assert driven.state().condition is sheet.standing
+    driven, there = connected(name)
+    assert driven.state().condition is sheet.standing
+    driven.set_frequency(20)
+    driven.start()
+    assert driven.state().condition is Condition.RUNNING
+    assert values(driven, sheet.shown) == pytest.approx(sheet.shown, abs=0.005)
+    driven.stop()
+    assert driven.state().condition is sheet.standing
+    assert there.words == [sheet.setpoint, *sheet.starts, *sheet.stops]
+    there.memory |= sheet.tripped
+    assert driven.state().condition is sheet.failed
+    there.words.clear()
+    if sheet.reset is None:
+        with pytest.raises(Unsupported):
+            driven.reset_fault()
+        return
+    driven.reset_fault()
+    before = sheet.stops if sheet.before_reset is None else sheet.before_reset
+    assert there.words == [*before, sheet.reset, *sheet.after_reset]  # any other word could run the motor
+    assert driven.state().condition is sheet.standing
 
 
 @table("name", READ_ONLY)
 def test_values_read_from_a_responder_without_commands_match_its_manual(name: str) -> None:
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        drive, there = connected(monkeypatch, name)
-        drive.bus.check_identity(drive)
-        assert values(drive, SHEETS[name].shown) == SHEETS[name].shown
-        assert there.words == []
+    drive, there = connected(name)
+    drive.bus.check_identity(drive)
+    assert values(drive, SHEETS[name].shown) == SHEETS[name].shown
+    assert there.words == []
 
 
 @pytest.mark.long
 @table("name", COMMANDED)
 def test_simulation_of_each_family_starts_stops_resets_and_is_read(name: str) -> None:
     sheet = SHEETS[name]
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        line, drive, sim = one(monkeypatch, made(name))
+    line, drive, sim = one(made(name))
+    assert drive.state().condition is sheet.standing
+    drive.set_frequency(20)
+    drive.start()
+    line.sleep(30)
+    assert drive.state().condition is Condition.RUNNING
+    assert {*drive.read_many(drive.readings())} == {register.name for register in drive.readings()}
+    assert sim.motor.frequency == pytest.approx(20, abs=0.005)
+    drive.stop()
+    assert not sim.motor.energised
+    sim.trip(FAULT)
+    assert drive.state().condition is sheet.failed
+    if sheet.reset is not None:
+        drive.reset_fault()
+        assert not sim.motor.fault
         assert drive.state().condition is sheet.standing
-        drive.set_frequency(20)
-        drive.start()
-        line.sleep(30)
-        assert drive.state().condition is Condition.RUNNING
-        assert {*drive.read_many(drive.readings())} == {register.name for register in drive.readings()}
-        assert sim.motor.frequency == pytest.approx(20, abs=0.005)
-        drive.stop()
-        assert not sim.motor.energised
-        sim.trip(FAULT)
-        assert drive.state().condition is sheet.failed
-        if sheet.reset is not None:
-            drive.reset_fault()
-            assert not sim.motor.fault
-            assert drive.state().condition is sheet.standing

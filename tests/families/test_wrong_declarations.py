@@ -65,9 +65,9 @@ def same_words(declared: str, there: str) -> bool:
 class Pair:
     """A declared drive, and a simulated drive of another make at its address, whose motor may turn."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, declared: str, there: str, turns: bool) -> None:
+    def __init__(self, declared: str, there: str, turns: bool) -> None:
         self.sim: Any = simulated(THERE[there](1))
-        self.bus = SimulatedBus(monkeypatch, self.sim)
+        self.bus = SimulatedBus(self.sim)
         self.drive = self.bus.attach(DECLARED[declared](1))
         if turns and isinstance(self.sim, MotorDrive):
             self.sim.motor.target = 20.0
@@ -83,12 +83,10 @@ class Pair:
 
 @every_declaration
 @table("there", THERE)
-def test_no_command_is_sent_to_a_drive_of_another_make(
-    monkeypatch: pytest.MonkeyPatch, declared: str, there: str
-) -> None:
+def test_no_command_is_sent_to_a_drive_of_another_make(declared: str, there: str) -> None:
     if declared == there or same_words(declared, there):
         return
-    pair = Pair(monkeypatch, declared, there, turns=False)
+    pair = Pair(declared, there, turns=False)
     for call in (lambda: pair.drive.set_frequency(20), pair.drive.start, pair.drive.reset_fault):
         with pytest.raises(BusError):
             call()
@@ -100,11 +98,11 @@ def test_no_command_is_sent_to_a_drive_of_another_make(
 @every_declaration
 @table("there", THERE)
 def test_stop_never_runs_another_makes_motor_or_succeeds_while_it_turns(
-    monkeypatch: pytest.MonkeyPatch, declared: str, turns: bool, there: str
+    declared: str, turns: bool, there: str
 ) -> None:
     if declared == there or same_words(declared, there):
         return
-    pair = Pair(monkeypatch, declared, there, turns)
+    pair = Pair(declared, there, turns)
     failure: BusError | None = None
     try:
         pair.drive.stop(seconds=1)
@@ -137,14 +135,12 @@ def test_documentation_lists_the_stops_that_are_withheld(declared: str, there: s
 
 
 @pytest.mark.parametrize("declared", ["delta-vfd-el", "delta-cp2000"])
-def test_parameter_with_the_value_of_the_address_does_not_hide_a_goodrive(
-    monkeypatch: pytest.MonkeyPatch, declared: str
-) -> None:
+def test_parameter_with_the_value_of_the_address_does_not_hide_a_goodrive(declared: str) -> None:
     """Register 0900H of a Goodrive is P09.00, the source of the PID reference.
 
     Its value may equal the address.
     """
-    pair = Pair(monkeypatch, declared, "invt-goodrive", turns=False)
+    pair = Pair(declared, "invt-goodrive", turns=False)
     show = pair.sim.answer
     pair.sim.answer = lambda request, now: (
         replace_data(request, 1) if request.start == 0x0900 else show(request, now)
@@ -160,10 +156,10 @@ def replace_data(request: Any, value: int) -> Any:
     return type(request)(request.address, request.function, data=value.to_bytes(2))
 
 
-def test_goodrive_declared_as_a_confirmed_innovert_ibd_does_not_run(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_goodrive_declared_as_a_confirmed_innovert_ibd_does_not_run() -> None:
     """The owner had confirmed the drive as an IBD before a Goodrive replaced it."""
     sim: Any = simulated(shipped("invt-goodrive", 1))
-    bus = SimulatedBus(monkeypatch, sim)
+    bus = SimulatedBus(sim)
     drive = bus.attach(InnovertIBD(1, confirmed=1))
     with pytest.raises(WriteForbidden, match="model invt-goodrive"):
         drive.start()
@@ -173,11 +169,9 @@ def test_goodrive_declared_as_a_confirmed_innovert_ibd_does_not_run(monkeypatch:
     assert not sim.motor.energised
 
 
-def test_delta_drive_declared_as_a_goodrive_is_stopped_but_gets_no_coast(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_delta_drive_declared_as_a_goodrive_is_stopped_but_gets_no_coast() -> None:
     """The word 5 stops both drives. The word 6 coasts a Goodrive, but would run a Delta."""
-    pair = Pair(monkeypatch, "invt-goodrive", "delta-vfd-el", turns=True)
+    pair = Pair("invt-goodrive", "delta-vfd-el", turns=True)
     with pytest.raises(WriteForbidden, match="multidrop stop PORT delta-vfd-el 1"):
         pair.drive.coast(seconds=1)
     assert pair.bus.written == []
@@ -186,8 +180,8 @@ def test_delta_drive_declared_as_a_goodrive_is_stopped_but_gets_no_coast(
     assert pair.bus.written != []
 
 
-def test_error_for_a_chf100a_declared_as_a_che_names_the_right_model(monkeypatch: pytest.MonkeyPatch) -> None:
-    pair = Pair(monkeypatch, "invt-che", "invt-chf100a", turns=True)
+def test_error_for_a_chf100a_declared_as_a_che_names_the_right_model() -> None:
+    pair = Pair("invt-che", "invt-chf100a", turns=True)
     with pytest.raises(WriteForbidden, match="declare model invt-chf100a"):
         pair.drive.start()
     assert pair.bus.written == []
@@ -195,18 +189,16 @@ def test_error_for_a_chf100a_declared_as_a_che_names_the_right_model(monkeypatch
     assert not pair.turns
 
 
-def test_erman_declared_as_an_optidrive_has_an_unknown_state(monkeypatch: pytest.MonkeyPatch) -> None:
-    pair = Pair(monkeypatch, "optidrive-e3", "erman-er-g-220", turns=True)
+def test_erman_declared_as_an_optidrive_has_an_unknown_state() -> None:
+    pair = Pair("optidrive-e3", "erman-er-g-220", turns=True)
     with pytest.raises(Unconfirmed, match=r"are all 0, and so may be unused registers .*: look at the motor"):
         pair.drive.stop()
     assert pair.turns
 
 
 @table("declared", COMMANDED)
-def test_stop_is_sent_although_a_gateway_answers_ffff_for_the_drive(
-    monkeypatch: pytest.MonkeyPatch, declared: str
-) -> None:
-    bus = SimulatedBus(monkeypatch)
+def test_stop_is_sent_although_a_gateway_answers_ffff_for_the_drive(declared: str) -> None:
+    bus = SimulatedBus()
     drive = bus.attach(DECLARED[declared](1))
     bus.answers = lambda request: (
         None

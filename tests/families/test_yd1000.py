@@ -441,7 +441,7 @@ def test_yd1000_reset_is_sent_once_and_followed_by_a_stop() -> None:
     assert turning.sent == []
 
 
-def test_yd1000_start_after_a_reset_requires_a_new_setpoint(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_yd1000_start_after_a_reset_requires_a_new_setpoint() -> None:
     """The restart loses the written setpoint. A start at the drive's own setpoint was not requested."""
     wire = Wire(YD1000(1), AT_30_HZ, turns=TURNS)
     wire.drive.set_frequency(30)
@@ -453,7 +453,7 @@ def test_yd1000_start_after_a_reset_requires_a_new_setpoint(monkeypatch: pytest.
     ):
         wire.drive.start()
     assert wire.sent == []
-    line, drive, sim = one(monkeypatch, YD1000(1))
+    line, drive, sim = one(YD1000(1))
     drive.set_frequency(30)
     sim.trip(4)
     drive.reset_fault()
@@ -562,8 +562,8 @@ def test_yd1000_stop_is_written_again_if_release_control_is_unconfirmed(is_sent:
     assert wire.sent == [RELEASE, STOP]
 
 
-def test_yd1000_panel_can_run_the_motor_after_release_control(monkeypatch: pytest.MonkeyPatch) -> None:
-    _, drive, sim = one(monkeypatch, YD1000(1))
+def test_yd1000_panel_can_run_the_motor_after_release_control() -> None:
+    _, drive, sim = one(YD1000(1))
     assert isinstance(sim, SimulatedYD1000)
     drive.write(drive.panel_frequency, 20.0)
     drive.stop()  # the stop takes control away from the panel
@@ -578,7 +578,7 @@ def test_yd1000_panel_can_run_the_motor_after_release_control(monkeypatch: pytes
     sim.panel_runs = True
     assert sim.motor.energised
     with pytest.raises(Unsupported, match="no way to return control"):
-        one(monkeypatch, DelixiModbus(1))[1].release_control()
+        one(DelixiModbus(1))[1].release_control()
 
 
 def test_yd1000_setpoint_is_written_to_1001h_and_limited_by_fh() -> None:
@@ -636,9 +636,9 @@ def test_yd1000_trip_is_detected_by_the_frozen_register_1200h() -> None:
     assert Wire(YD1000(1), starting).drive.state().condition is Condition.STOPPED
 
 
-def test_yd1000_start_after_an_emergency_stop_advises_reset_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_yd1000_start_after_an_emergency_stop_advises_reset_fault() -> None:
     """This also holds for a new drive object, as each call of the command line creates one."""
-    line, drive, sim = one(monkeypatch, YD1000(1))
+    line, drive, sim = one(YD1000(1))
     drive.set_frequency(30)
     drive.start()
     line.sleep(3)
@@ -655,22 +655,20 @@ def test_yd1000_start_after_an_emergency_stop_advises_reset_fault(monkeypatch: p
     assert sim.motor.energised
 
 
-def test_yd1000_start_after_an_emergency_stop_at_rest_advises_reset_fault(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_yd1000_start_after_an_emergency_stop_at_rest_advises_reset_fault() -> None:
     """No register is frozen in this case.
 
     Only an object that had read the fault record could see a new entry.
     """
-    _, drive, _ = one(monkeypatch, YD1000(1))
+    _, drive, _ = one(YD1000(1))
     drive.emergency_stop()
     drive.set_frequency(30)
     with pytest.raises(Unconfirmed, match=r"not seen to run; .*emergency stop the drive needs reset_fault"):
         drive.start()
 
 
-def test_yd1000_watchdog_write_is_refused_while_the_motor_turns(monkeypatch: pytest.MonkeyPatch) -> None:
-    _, drive, sim = one(monkeypatch, YD1000(1))
+def test_yd1000_watchdog_write_is_refused_while_the_motor_turns() -> None:
+    _, drive, sim = one(YD1000(1))
     assert drive.write(drive.communication_timeout, 5) == 5
     assert sim["communication_timeout"] == 5
     for wrong in (-1, 101, 0.5):
@@ -683,8 +681,8 @@ def test_yd1000_watchdog_write_is_refused_while_the_motor_turns(monkeypatch: pyt
 
 
 @table("speed", range(1, 8))
-def test_simulated_yd1000_runs_at_the_preset_speed(monkeypatch: pytest.MonkeyPatch, speed: int) -> None:
-    line, drive, sim = one(monkeypatch, YD1000(1, preset_speed=speed))
+def test_simulated_yd1000_runs_at_the_preset_speed(speed: int) -> None:
+    line, drive, sim = one(YD1000(1, preset_speed=speed))
     sim[f"preset_speed_{speed}"] = 12.5
     drive.start()
     line.sleep(60)

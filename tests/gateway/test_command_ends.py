@@ -99,11 +99,9 @@ def test_the_result_of_a_command_names_a_drive_that_was_removed_from_its_line(
     ids=["huge", "huge below 0", "inf", "nan", "1.5"],
 )
 @table("register", ["setpoint", "control"])
-def test_an_invalid_number_in_a_write_is_reported(
-    register: str, value: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_invalid_number_in_a_write_is_reported(register: str, value: float) -> None:
     """JSON allows integers that are too large for a float."""
-    line, mill, _ = one(monkeypatch, InvtCHE(1, name="mill", maximum_frequency=50))
+    line, mill, _ = one(InvtCHE(1, name="mill", maximum_frequency=50))
     lines = UnopenedLines()
     lines.plant = plant_of(("hall", mill))
     may = May(write=frozenset({"mill.control", "mill.setpoint"}))
@@ -124,12 +122,10 @@ async def test_a_refused_command_has_no_end_time() -> None:
 
 
 @pytest.mark.parametrize("verb", ["stop", "coast"])
-def test_a_drive_name_in_another_unicode_spelling_works_for_stops_only(
-    verb: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_drive_name_in_another_unicode_spelling_works_for_stops_only(verb: str) -> None:
     """A u with two dots is one character (U+00FC) on some keyboards, and two (U+0075 U+0308) on others."""
     fan, spelt = "L\u00fcfter", "Lu\u0308fter"
-    line, known, _ = one(monkeypatch, InvtCHE(1, name=fan, maximum_frequency=50))
+    line, known, _ = one(InvtCHE(1, name=fan, maximum_frequency=50))
     lines = UnopenedLines()
     lines.plant = plant_of(("hall", known))
     lines.bus = lambda name: known.bus  # type: ignore[method-assign, assignment, return-value]

@@ -187,9 +187,7 @@ REPLY = """
 """
 
 
-def test_values_decoded_from_a_published_sunspec_reply_are_right(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_values_decoded_from_a_published_sunspec_reply_are_right(tmp_path: Path) -> None:
     points: list[dict[str, Any]] = [{"name": name, "type": "uint16", "size": 1} for name in ("ID", "L")]
     for name in POINTS.split():
         kind = "sunssf" if name.endswith("_SF") else "int16" if name in SIGNED else "uint16"
@@ -201,7 +199,7 @@ def test_values_decoded_from_a_published_sunspec_reply_are_right(
     for address, word in enumerate(bytes.fromhex(REPLY).hex(" ", 2).split(), 40002):
         if (cell := sim.memory.readable(3, address)) is not None:
             cell.raw = int(word, 16)
-    drive = SimulatedBus(monkeypatch, sim).attach(sim.drive)
+    drive = SimulatedBus(sim).attach(sim.drive)
     found = {name: drive.read(drive.register(name)) for name in ("w", "dcw", "hz", "tmpsnk")}
     assert found == pytest.approx({"w": 1389.4, "dcw": 1410.5, "hz": 49.982, "tmpsnk": 41.69})
     with pytest.raises(NoValue):

@@ -64,20 +64,16 @@ def made(family: type[Drive]) -> Drive:
     return family(1, **({"confirmed": 1} if family.declared_in else {}))
 
 
-def attached(
-    monkeypatch: pytest.MonkeyPatch, drive: Drive, extra: list[str]
-) -> tuple[SimulatedBus, Drive, MotorDrive]:
+def attached(drive: Drive, extra: list[str]) -> tuple[SimulatedBus, Drive, MotorDrive]:
     sim = with_parameters(drive, extra)
     obey_the_line(sim)
-    line = SimulatedBus(monkeypatch, sim)
+    line = SimulatedBus(sim)
     return line, line.attach(drive), sim
 
 
 @pytest.mark.parametrize("family", usually(GOODRIVE, *[one for one in EXTRA if one is not GOODRIVE]))
-def test_saved_parameters_are_restored_after_a_factory_reset(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, family: type[Drive]
-) -> None:
-    line, drive, sim = attached(monkeypatch, made(family), EXTRA[family])
+def test_saved_parameters_are_restored_after_a_factory_reset(tmp_path: Path, family: type[Drive]) -> None:
+    line, drive, sim = attached(made(family), EXTRA[family])
     there = writable(drive, EXTRA[family])
     assert there
     set_at_random(sim, there, Random(7))
@@ -102,10 +98,8 @@ def test_saved_parameters_are_restored_after_a_factory_reset(
 
 
 @pytest.mark.parametrize("family", FAMILIES)
-def test_running_motor_makes_apply_raise_and_write_nothing(
-    monkeypatch: pytest.MonkeyPatch, family: type[Drive]
-) -> None:
-    line, drive, sim = attached(monkeypatch, made(family), EXTRA[family])
+def test_running_motor_makes_apply_raise_and_write_nothing(family: type[Drive]) -> None:
+    line, drive, sim = attached(made(family), EXTRA[family])
     first = writable(drive, EXTRA[family])[0]
     sim.motor.target = 50.0
     sim.motor.run()
@@ -115,8 +109,8 @@ def test_running_motor_makes_apply_raise_and_write_nothing(
     assert line.written == []
 
 
-def test_run_command_at_zero_speed_makes_apply_raise(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, sim = attached(monkeypatch, YD1000(1), [])
+def test_run_command_at_zero_speed_makes_apply_raise() -> None:
+    line, drive, sim = attached(YD1000(1), [])
     sim.motor.target = 0.0
     sim.motor.run()
     with pytest.raises(WriteForbidden, match="run command"):
@@ -124,10 +118,8 @@ def test_run_command_at_zero_speed_makes_apply_raise(monkeypatch: pytest.MonkeyP
     assert line.written == []
 
 
-def test_a_stop_is_sent_before_the_writes_if_the_motor_state_is_unknown(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    line, drive, _ = attached(monkeypatch, DelixiModbus(1), ["P01.00"])
+def test_a_stop_is_sent_before_the_writes_if_the_motor_state_is_unknown() -> None:
+    line, drive, _ = attached(DelixiModbus(1), ["P01.00"])
     params.plan(drive, {"P01.00": 5})
     assert line.written == []
     assert params.apply(drive, {"P01.00": 5}).ok
@@ -135,10 +127,8 @@ def test_a_stop_is_sent_before_the_writes_if_the_motor_state_is_unknown(
 
 
 @pytest.mark.parametrize("family", [DelixiModbus, DelixiNative])
-def test_apply_raises_if_the_panel_may_start_the_motor(
-    monkeypatch: pytest.MonkeyPatch, family: type[Drive]
-) -> None:
-    line, drive, sim = attached(monkeypatch, family(1), ["P01.00"])
+def test_apply_raises_if_the_panel_may_start_the_motor(family: type[Drive]) -> None:
+    line, drive, sim = attached(family(1), ["P01.00"])
     sim["run_source"] = 0
     with pytest.raises(WriteForbidden, match=r"its run_source \(P00\.00\) is KEYPAD"):
         params.plan(drive, {"P01.00": 5})
@@ -153,17 +143,15 @@ def test_apply_raises_if_the_panel_may_start_the_motor(
         ({"0009": 0, "0010": 1}, "has values that may not be written: "),
     ],
 )
-def test_one_invalid_value_makes_apply_write_nothing(
-    monkeypatch: pytest.MonkeyPatch, values: dict[str, int], sentence: str
-) -> None:
-    line, drive, _ = attached(monkeypatch, YD1000(1), [])
+def test_one_invalid_value_makes_apply_write_nothing(values: dict[str, int], sentence: str) -> None:
+    line, drive, _ = attached(YD1000(1), [])
     with pytest.raises(ValueError, match=sentence):
         params.apply(drive, values)
     assert line.written == []
 
 
-def test_parameters_of_another_model_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    _, drive, _ = attached(monkeypatch, YD1000(1), [])
+def test_parameters_of_another_model_are_refused() -> None:
+    _, drive, _ = attached(YD1000(1), [])
     other = params.ParameterSet("delixi-modbus", {"P01.00": 1}, source="other.toml")
     with pytest.raises(ValueError, match=r"parameters of yd1000, and other\.toml of delixi-modbus"):
         params.apply(drive, other)
@@ -172,10 +160,8 @@ def test_parameters_of_another_model_are_refused(monkeypatch: pytest.MonkeyPatch
 # ---- parameters that are left out ----
 
 
-def test_communication_parameters_are_written_only_with_the_option_also(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    _, drive, sim = attached(monkeypatch, YD1000(1), [])
+def test_communication_parameters_are_written_only_with_the_option_also() -> None:
+    _, drive, sim = attached(YD1000(1), [])
     left = params.apply(drive, {"F803": 30, "F801": 0, "F111": 3}, also=["F801"])
     assert left.plan.left == {"F111": f"{COMMAND} (2 -> 3)"}
     assert [change.parameter.code for change in left.plan.writes] == [
@@ -188,8 +174,8 @@ def test_communication_parameters_are_written_only_with_the_option_also(
     assert sim["communication_timeout"] == 30
 
 
-def test_backup_file_of_the_gd20_tool_is_restored(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    _, drive, _ = attached(monkeypatch, made(GOODRIVE), ["P00.03", "P14.01", "P00.18"])
+def test_backup_file_of_the_gd20_tool_is_restored(tmp_path: Path) -> None:
+    _, drive, _ = attached(made(GOODRIVE), ["P00.03", "P14.01", "P00.18"])
     rows = ["0;3;6000", "0;18;1", "14;1;3", "7;13;104", "17;0;5000"]
     text = "\n".join(["GRUPO_PARAMETRO;CODIGO_FUNCAO;VALOR_PARAMETRO", *rows])
     (tmp_path / "bkp_result.csv").write_text(text)
@@ -198,13 +184,13 @@ def test_backup_file_of_the_gd20_tool_is_restored(monkeypatch: pytest.MonkeyPatc
     assert [*done.plan.left] == ["P00.18", "P14.01"]
 
 
-def test_motor_identification_of_a_delixi_e_is_not_started(monkeypatch: pytest.MonkeyPatch) -> None:
-    _, drive, _ = attached(monkeypatch, made(DELIXI_E), ["P0.0.24"])
+def test_motor_identification_of_a_delixi_e_is_not_started() -> None:
+    _, drive, _ = attached(made(DELIXI_E), ["P0.0.24"])
     assert "identification of the motor" in params.plan(drive, {"P0.0.24": 1}).left["P0.0.24"]
 
 
-def test_parameter_that_the_drive_lacks_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    _, drive, _ = attached(monkeypatch, YD1000(1), [])
+def test_parameter_that_the_drive_lacks_is_left_out() -> None:
+    _, drive, _ = attached(YD1000(1), [])
     assert params.plan(drive, {"F240": 5}).left == {"F240": "the drive does not have it"}
 
 
@@ -216,17 +202,17 @@ def test_parameter_that_the_drive_lacks_is_left_out(monkeypatch: pytest.MonkeyPa
     ],
 )
 def test_parameters_are_written_in_an_order_that_keeps_their_limits(
-    monkeypatch: pytest.MonkeyPatch, values: dict[str, int], order: list[str]
+    values: dict[str, int], order: list[str]
 ) -> None:
-    _, drive, sim = attached(monkeypatch, YD1000(1), [])
+    _, drive, sim = attached(YD1000(1), [])
     done = params.apply(drive, values)
     assert done.ok
     assert [change.parameter.code for change in done.written] == order
     assert sim["maximum_frequency"] == values["0011"] / 100
 
 
-def test_a_value_above_its_upper_limit_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    _, drive, _ = attached(monkeypatch, YD1000(1), [])
+def test_a_value_above_its_upper_limit_is_left_out() -> None:
+    _, drive, _ = attached(YD1000(1), [])
     left = params.plan(drive, {"0013": 9000}).left
     assert left == {"0013": "90.00 Hz is outside its limits, which are upper_limit_frequency of yd1000@1"}
 
@@ -234,11 +220,9 @@ def test_a_value_above_its_upper_limit_is_left_out(monkeypatch: pytest.MonkeyPat
 # ---- the EEPROM ledger and the journal of writes ----
 
 
-def test_second_write_within_a_minute_is_refused_without_commissioning(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_second_write_within_a_minute_is_refused_without_commissioning(tmp_path: Path) -> None:
     sim = with_parameters(YD1000(1))
-    line = SimulatedBus(monkeypatch, sim, audit=tmp_path / "audit.jsonl")
+    line = SimulatedBus(sim, audit=tmp_path / "audit.jsonl")
     drive = line.attach(sim.drive)
     assert params.apply(drive, {"0009": 200}).ok
     again = params.apply(drive, {"0009": 300, "0010": 300})
@@ -253,7 +237,7 @@ def test_second_write_within_a_minute_is_refused_without_commissioning(
 
 
 def test_a_refused_write_does_not_prevent_the_other_writes(monkeypatch: pytest.MonkeyPatch) -> None:
-    _, drive, sim = attached(monkeypatch, DelixiNative(1), ["P01.00", "P01.01"])
+    _, drive, sim = attached(DelixiNative(1), ["P01.00", "P01.01"])
     accept = type(sim).accept
 
     def picky(self: Any, cell: MemoryCell, raw: int) -> int:
@@ -267,8 +251,8 @@ def test_a_refused_write_does_not_prevent_the_other_writes(monkeypatch: pytest.M
     assert "value out of limits" in str(done.refused["P01.00"])
 
 
-def test_an_interrupted_apply_is_reported_by_the_next_apply(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, _ = attached(monkeypatch, YD1000(1), [])
+def test_an_interrupted_apply_is_reported_by_the_next_apply() -> None:
+    line, drive, _ = attached(YD1000(1), [])
     line.deafens = lambda request: request.function == 6 and request.start == 0x0010
     first = params.apply(drive, {"0009": 200, "0010": 200, "0018": 100})
     assert isinstance(first.failure, Unconfirmed)
@@ -280,8 +264,8 @@ def test_an_interrupted_apply_is_reported_by_the_next_apply(monkeypatch: pytest.
     assert params.apply(drive, {"0009": 200}).earlier == []
 
 
-def test_a_motor_that_starts_during_apply_ends_the_apply(monkeypatch: pytest.MonkeyPatch) -> None:
-    _, drive, sim = attached(monkeypatch, YD1000(1), [])
+def test_a_motor_that_starts_during_apply_ends_the_apply() -> None:
+    _, drive, sim = attached(YD1000(1), [])
 
     def start(number: int, total: int, change: params.ParameterChange, not_written: object) -> None:
         sim.motor.target = 50.0
@@ -293,9 +277,9 @@ def test_a_motor_that_starts_during_apply_ends_the_apply(monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize("family", [YD1000, DelixiModbus])  # a Delixi is sent a stop before its first write
-def test_a_stop_during_apply_ends_the_apply(monkeypatch: pytest.MonkeyPatch, family: type[Drive]) -> None:
+def test_a_stop_during_apply_ends_the_apply(family: type[Drive]) -> None:
     values = {"0009": 200, "0010": 200} if family is YD1000 else {"P01.00": 5, "P01.01": 6}
-    line, drive, _ = attached(monkeypatch, family(1), EXTRA[family])
+    line, drive, _ = attached(family(1), EXTRA[family])
     done = params.apply(drive, values, report=lambda *_: drive.stop())
     assert [change.parameter.code for change in done.written] == [next(iter(values))]
     assert isinstance(done.failure, CancelledByStop)
@@ -305,7 +289,7 @@ def test_a_stop_during_apply_ends_the_apply(monkeypatch: pytest.MonkeyPatch, fam
 
 
 def test_stop_while_the_plan_is_read_cancels_all_writes(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, _ = attached(monkeypatch, made(GOODRIVE), EXTRA[GOODRIVE])
+    line, drive, _ = attached(made(GOODRIVE), EXTRA[GOODRIVE])
     read = drive.link.read_raw
     monkeypatch.setattr(drive.link, "read_raw", lambda *given: (drive.stop(), read(*given))[1])
     done = params.apply(drive, {"P00.03": 6000})
@@ -318,7 +302,7 @@ def test_stop_while_the_plan_is_read_cancels_all_writes(monkeypatch: pytest.Monk
 def test_a_full_disk_ends_apply_and_the_next_apply_completes_the_writes(
     monkeypatch: pytest.MonkeyPatch, room: int
 ) -> None:
-    line, drive, _ = attached(monkeypatch, ErmanERG220(1), [])
+    line, drive, _ = attached(ErmanERG220(1), [])
     # the EEPROM ledger is not affected by the full disk
     monkeypatch.setattr(Ledger, "enter", lambda *given: "")
     values = {"b.003": 150, "b.004": 160}
@@ -337,7 +321,7 @@ def test_a_full_disk_ends_apply_and_the_next_apply_completes_the_writes(
 
 
 def test_apply_returns_its_result_if_the_journal_cannot_be_removed(monkeypatch: pytest.MonkeyPatch) -> None:
-    _, drive, _ = attached(monkeypatch, ErmanERG220(1), [])
+    _, drive, _ = attached(ErmanERG220(1), [])
 
     def refuse(*given: object, **options: object) -> None:
         raise PermissionError
@@ -348,8 +332,8 @@ def test_apply_returns_its_result_if_the_journal_cannot_be_removed(monkeypatch: 
     assert [change.parameter.code for change in done.written] == ["b.003"]
 
 
-def test_a_refused_second_write_suggests_the_command_that_permits_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    _, drive, _ = attached(monkeypatch, YD1000(1), [])
+def test_a_refused_second_write_suggests_the_command_that_permits_it() -> None:
+    _, drive, _ = attached(YD1000(1), [])
     drive.write("acceleration_time", 20.0)
     with pytest.raises(WriteForbidden, match=r"params\.apply") as refusal:
         drive.write("acceleration_time", 30.0)

@@ -41,16 +41,14 @@ class Limited(SimulatedDrive):
         return super().read(function, start, count)
 
 
-def blocky(
-    monkeypatch: pytest.MonkeyPatch, missing: set[str], longest: int = 16
-) -> tuple[SimulatedBus, Drive]:
+def blocky(missing: set[str], longest: int = 16) -> tuple[SimulatedBus, Drive]:
     sim = Limited(Blocky(1))
     sim.longest = longest
     for number, (code, parameter) in enumerate(parameters_of(Blocky).items()):
         if code not in missing:
             sim.memory.declare(parameter)
             sim.memory.set_raw(parameter, number)
-    line = SimulatedBus(monkeypatch, sim)
+    line = SimulatedBus(sim)
     return line, line.attach(sim.drive)
 
 
@@ -58,41 +56,41 @@ def counts(line: SimulatedBus) -> list[int]:
     return [request.count for request, _ in line.frames]
 
 
-def test_parameters_are_read_in_few_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive = blocky(monkeypatch, set())
+def test_parameters_are_read_in_few_blocks() -> None:
+    line, drive = blocky(set())
     assert dict(params.read(drive).values) == {code: number for number, code in enumerate(CODES)}
     assert counts(line) == [16, 16]
 
 
-def test_a_refused_block_does_not_prevent_reading_the_other_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive = blocky(monkeypatch, {"P00.05"})
+def test_a_refused_block_does_not_prevent_reading_the_other_blocks() -> None:
+    line, drive = blocky({"P00.05"})
     assert set(params.read(drive).values) == {*CODES} - {"P00.05"}
     assert counts(line) == [16, 8, 4, 4, 2, 1, 1, 2, 8, 16]
 
 
-def test_the_longest_block_that_the_drive_accepts_is_learnt(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive = blocky(monkeypatch, set(), longest=8)
+def test_the_longest_block_that_the_drive_accepts_is_learnt() -> None:
+    line, drive = blocky(set(), longest=8)
     assert len(params.read(drive).values) == 32
     assert counts(line) == [16, 8, 8, 8, 8]
 
 
-def test_read_with_codes_reads_only_these_parameters(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive = blocky(monkeypatch, set())
+def test_read_with_codes_reads_only_these_parameters() -> None:
+    line, drive = blocky(set())
     assert dict(params.read(drive, ["P01.02"]).values) == {"P01.02": 18}
     assert counts(line) == [1]
     with pytest.raises(ValueError, match=r"has no parameter P09\.00"):
         params.read(drive, ["P09.00"])
 
 
-def test_a_parameter_group_without_replies_is_abandoned(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, _ = one(monkeypatch, DelixiModbus(1))
+def test_a_parameter_group_without_replies_is_abandoned() -> None:
+    line, drive, _ = one(DelixiModbus(1))
     found = params.read(drive).values
     assert [*found] == ["P00.00", "P00.01", "P00.02", "P04.28", "P04.29", "P04.30"]
     assert len(line.frames) < 5 * 10 * 8
 
 
-def test_a_silent_drive_raises_the_error_no_reply(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, _ = one(monkeypatch, DelixiNative(1))
+def test_a_silent_drive_raises_the_error_no_reply() -> None:
+    line, drive, _ = one(DelixiNative(1))
     asked: list[Message] = []
     line.deafens = lambda request: bool(asked.append(request)) or len(asked) > 20
     with pytest.raises(NoReply):
@@ -149,8 +147,8 @@ def test_explained_parameters_of_a_delixi_e_are_written() -> None:
     assert {code for code, one in known.items() if not one.never} == {*named}
 
 
-def test_a_family_without_parameter_addresses_raises_unsupported(monkeypatch: pytest.MonkeyPatch) -> None:
-    _, drive, _ = one(monkeypatch, InvtCHE(1))
+def test_a_family_without_parameter_addresses_raises_unsupported() -> None:
+    _, drive, _ = one(InvtCHE(1))
     with pytest.raises(
         Unsupported, match=r"no reliable rule .* invt-che: read and write its declared registers instead"
     ):

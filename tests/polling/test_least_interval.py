@@ -138,9 +138,9 @@ def test_reads_with_bus_keep_the_least_interval() -> None:
     assert sim.early == 0
 
 
-def test_the_least_interval_extends_the_expiry_of_a_write(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_least_interval_extends_the_expiry_of_a_write() -> None:
     drive = family(1, least_interval=2.0)(1)
-    SimulatedBus(monkeypatch, Picky(drive)).attach(drive)
+    SimulatedBus(Picky(drive)).attach(drive)
     patient = Call(drive, Latch().permit(), 1.0)
     eager = Call(family(1)(2), Latch().permit(), 1.0)
     assert patient.expires_ns - eager.expires_ns == 2 * S

@@ -127,10 +127,8 @@ def test_frames_are_logged_only_at_level_debug(caplog: pytest.LogCaptureFixture)
     assert "Message(address=1, function=3" in reply
 
 
-def test_writes_refusals_and_stops_are_logged(
-    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    _, drive, _ = one(monkeypatch, InvtCHE(1, name="pump-1", maximum_frequency=50))
+def test_writes_refusals_and_stops_are_logged(caplog: pytest.LogCaptureFixture) -> None:
+    _, drive, _ = one(InvtCHE(1, name="pump-1", maximum_frequency=50))
     bus: Any = drive.bus
     with caplog.at_level(logging.INFO, "multidrop"):
         drive.set_frequency(20)
@@ -155,8 +153,8 @@ class Hanging(logging.Handler):
         self.released.wait(PATIENCE)
 
 
-def test_a_stop_is_repeated_although_a_log_handler_hangs(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, _ = one(monkeypatch, InvtCHE(1))
+def test_a_stop_is_repeated_although_a_log_handler_hangs() -> None:
+    line, drive, _ = one(InvtCHE(1))
     handler, logger = Hanging(), logging.getLogger("multidrop.control")
     line.answers = lambda request: b"" if len(line.frames) < 6 else None
     logger.addHandler(handler)

@@ -294,17 +294,17 @@ def test_drives_of_a_model_share_decoders_only_for_equal_blocks() -> None:
 WIDE = 24
 
 
-def picky(monkeypatch: pytest.MonkeyPatch, **faults: Any) -> tuple[Drive, Picky, SimulatedBus]:
+def picky(**faults: Any) -> tuple[Drive, Picky, SimulatedBus]:
     """Return a drive on a bus with registers 0 to WIDE - 1, its simulation with these faults, and the bus."""
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive, **faults)
-    bus = SimulatedBus(monkeypatch, sim)
+    bus = SimulatedBus(sim)
     bus.attach(drive)
     return drive, sim, bus
 
 
-def test_a_refused_request_is_split_until_the_port_is_reopened(monkeypatch: pytest.MonkeyPatch) -> None:
-    drive, sim, bus = picky(monkeypatch, most=8)
+def test_a_refused_request_is_split_until_the_port_is_reopened() -> None:
+    drive, sim, bus = picky(most=8)
     first = drive.read_many(drive.registers.values())
     assert first == expected_values(range(WIDE))
     assert [count for _, count in sim.asked] == [24, 12, 6, 6, 12, 6, 6]
@@ -317,8 +317,8 @@ def test_a_refused_request_is_split_until_the_port_is_reopened(monkeypatch: pyte
     assert sim.asked[0] == (0, WIDE)
 
 
-def test_the_error_for_a_refused_request_names_the_refused_register(monkeypatch: pytest.MonkeyPatch) -> None:
-    drive, sim, _ = picky(monkeypatch, refused={3})
+def test_the_error_for_a_refused_request_names_the_refused_register() -> None:
+    drive, sim, _ = picky(refused={3})
     with pytest.raises(DriveException, match=r"^pump-1 refuses r3: ") as caught:
         drive.read_many(drive.registers.values())
     assert caught.value.register == "r3"
@@ -339,24 +339,23 @@ def test_a_read_is_complete_or_names_the_refused_register(
     refused: set[int], most: int, asked: set[int]
 ) -> None:
     drive = family(6)(1, name="pump-1")
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        bus = SimulatedBus(monkeypatch, Picky(drive, refused, most)).bus
-        bus.attach(drive)
-        registers = [drive.register(f"r{at}") for at in sorted(asked)]
-        for _ in range(2):  # the second read starts with the parts
-            if not refused & asked:
-                assert drive.read_many(registers) == expected_values(asked)
-                continue
-            with pytest.raises(DriveException) as caught:
-                drive.read_many(registers)
-            assert caught.value.register in {f"r{at}" for at in refused & asked}
+    bus = SimulatedBus(Picky(drive, refused, most)).bus
+    bus.attach(drive)
+    registers = [drive.register(f"r{at}") for at in sorted(asked)]
+    for _ in range(2):  # the second read starts with the parts
+        if not refused & asked:
+            assert drive.read_many(registers) == expected_values(asked)
+            continue
+        with pytest.raises(DriveException) as caught:
+            drive.read_many(registers)
+        assert caught.value.register in {f"r{at}" for at in refused & asked}
 
 
 @pytest.mark.parametrize("code", [1, 5, 6])
 def test_a_request_that_the_drive_refuses_as_busy_is_not_split(
     code: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    drive, sim, _ = picky(monkeypatch)
+    drive, sim, _ = picky()
     sim.limit = 0
     monkeypatch.setattr(sim, "_code", lambda reason: code)
     with pytest.raises(DriveException):
@@ -367,7 +366,7 @@ def test_a_request_that_the_drive_refuses_as_busy_is_not_split(
 def test_the_error_for_several_refused_registers_names_none(monkeypatch: pytest.MonkeyPatch) -> None:
     scaled = {"flow": reading(2, scale_register="power"), "power": reading(3, number_format=NumberFormat.I16)}
     drive = family(2, **scaled)(1, name="pump-1")
-    bus = SimulatedBus(monkeypatch, sim := Picky(drive))
+    bus = SimulatedBus(sim := Picky(drive))
     bus.attach(drive)
     sim.limit = 0
     monkeypatch.setattr(sim, "_code", lambda reason: 6)
@@ -376,18 +375,16 @@ def test_the_error_for_several_refused_registers_names_none(monkeypatch: pytest.
     assert caught.value.register is None
 
 
-def test_a_long_request_without_a_reply_is_split(monkeypatch: pytest.MonkeyPatch) -> None:
-    drive, sim, _ = picky(monkeypatch, silent_beyond=8)
+def test_a_long_request_without_a_reply_is_split() -> None:
+    drive, sim, _ = picky(silent_beyond=8)
     assert drive.read_many(drive.registers.values()) == expected_values(range(WIDE))
     sim.asked.clear()
     assert drive.read_many(drive.registers.values()) == expected_values(range(WIDE))
     assert [count for _, count in sim.asked] == [6] * 4
 
 
-def test_a_dead_drive_gets_only_one_additional_shorter_request(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    drive, sim, _ = picky(monkeypatch, silent_beyond=0)
+def test_a_dead_drive_gets_only_one_additional_shorter_request() -> None:
+    drive, sim, _ = picky(silent_beyond=0)
     with pytest.raises(NoReply):
         drive.read_many(drive.registers.values())
     assert sim.asked == [(0, WIDE)] * 3 + [(0, 1)]
@@ -401,12 +398,10 @@ def test_a_dead_drive_gets_only_one_additional_shorter_request(
 
 
 @pytest.mark.parametrize("silent", [{1}, {1, 2}, {0, 2}])
-def test_a_foreign_reply_to_only_one_attempt_is_reported(
-    monkeypatch: pytest.MonkeyPatch, silent: set[int]
-) -> None:
+def test_a_foreign_reply_to_only_one_attempt_is_reported(silent: set[int]) -> None:
     """The attempts in `silent` receive nothing. The other attempts receive a reply from another address."""
     drive = family(2)(1, name="pump-1")
-    bus = SimulatedBus(monkeypatch, Picky(drive))
+    bus = SimulatedBus(Picky(drive))
     bus.attach(drive)
     attempts = itertools.count()
     foreign = checksums.rtu(bytes.fromhex("63 03 02 00 07"))
@@ -420,10 +415,10 @@ def test_a_foreign_reply_to_only_one_attempt_is_reported(
 
 
 @pytest.fixture
-def simulated(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[SimulatedBus]:
+def simulated(tmp_path: Path) -> Iterator[SimulatedBus]:
     toy = SimulatedDrive(Toy(7))
     toy["output_frequency"], toy["output_current"] = 12.3, 1.5
-    bus = SimulatedBus(monkeypatch, toy, audit=tmp_path / "audit.jsonl")
+    bus = SimulatedBus(toy, audit=tmp_path / "audit.jsonl")
     bus.attach(toy.drive)
     with bus.bus:
         yield bus
@@ -533,11 +528,11 @@ def test_send_raw_rejects_read_functions_before_sending(
     assert simulated.frames == []
 
 
-def test_read_raw_respects_the_familys_limits(monkeypatch: pytest.MonkeyPatch) -> None:
-    _, native, _ = one(monkeypatch, DelixiNative(1))
+def test_read_raw_respects_the_familys_limits() -> None:
+    _, native, _ = one(DelixiNative(1))
     with pytest.raises(ValueError, match="speaks Delixi's own protocol"):
         native.read_raw(3, 1, 1)
-    bus, modbus, _ = one(monkeypatch, DelixiModbus(1))
+    bus, modbus, _ = one(DelixiModbus(1))
     with pytest.raises(ValueError, match="count = 2 is outside 1 to 1"):
         modbus.read_raw(3, 1, 2)
     with pytest.raises(NotAttached, match="fan is not attached to a bus: use bus"):

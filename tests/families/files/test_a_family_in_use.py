@@ -164,15 +164,13 @@ def test_unconfirmed_family_file_with_commands_writes_only_harmless_raw_counts(
         assert simulated_writes(line) == []
 
 
-def test_no_broadcast_is_sent_for_an_unconfirmed_family_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_broadcast_is_sent_for_an_unconfirmed_family_file(tmp_path: Path) -> None:
     """`stop_all` does not send the file's broadcasts, because they are untested."""
     path = tmp_path / "fan.toml"
     head = '[family]\ntitle = "Fan"\nmanual = "M"\ncounts_from = 0\n[reading]\nspeed = { at = 1 }\n'
     path.write_text(head + "[command]\ncontrol = { at = 0, broadcast = [0x047F] }\n")
     fan = load_family(path)
-    line = SimulatedBus(monkeypatch, simulated(fan(1)), simulated(fan(2)))
+    line = SimulatedBus(simulated(fan(1)), simulated(fan(2)))
     first, second = line.attach(fan(1)), line.attach(fan(2))
     with pytest.raises(WriteForbidden, match="declare confirmed = 1"):
         line.bus.broadcast(first.control, 0x047F)
@@ -209,13 +207,13 @@ def test_family_file_without_commands_needs_no_confirmation(plant: Path) -> None
     ],
 )
 def test_identify_section_recognises_drives_by_their_register_values(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, proof: str, value: int, is_one: bool
+    tmp_path: Path, proof: str, value: int, is_one: bool
 ) -> None:
     path = tmp_path / "meter.toml"
     head = '[family]\ntitle = "Meter"\nmanual = "M"\ncounts_from = 0\n[reading]\ndevice = { at = 3 }\n'
     path.write_text(f'{head}[[identify]]\nregister = "device"\n{proof}\n')
     drive = load_family(path)(1)
-    line = SimulatedBus(monkeypatch, sim := simulated(drive))
+    line = SimulatedBus(sim := simulated(drive))
     line.bus.attach(drive)
     sim["device"] = value
     if is_one:

@@ -24,16 +24,16 @@ def model(request: pytest.FixtureRequest) -> str:
 
 
 @pytest.fixture
-def line(monkeypatch: pytest.MonkeyPatch, model: str) -> Line:
-    return Line(monkeypatch, model)
+def line(model: str) -> Line:
+    return Line(model)
 
 
 class Line:
     """A simulated bus with one drive. `starts` has the sent requests that start the motor."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, model: str) -> None:
+    def __init__(self, model: str) -> None:
         self.is_start = STARTS[model]
-        self.bus, self.drive, self.sim = one(monkeypatch, ALL[model](1))
+        self.bus, self.drive, self.sim = one(ALL[model](1))
         self.set_ramps(1.0)
 
     def set_ramps(self, seconds: float) -> None:
@@ -184,8 +184,8 @@ LOCAL = {
 
 
 @table("model", LOCAL)
-def test_start_is_refused_while_the_keypad_is_in_control(model: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    line = Line(monkeypatch, model)
+def test_start_is_refused_while_the_keypad_is_in_control(model: str) -> None:
+    line = Line(model)
     line.drive.set_frequency(20)
     line.sim.is_local = True
     begun = len(line.writes)
@@ -257,8 +257,8 @@ def test_ramp_continues_from_the_setpoint_in_force(line: Line) -> None:
     assert line.sim.motor.target == pytest.approx(22, abs=0.01)
 
 
-def test_jog_that_continues_after_a_stop_is_ended_by_stop_jog(monkeypatch: pytest.MonkeyPatch) -> None:
-    line = Line(monkeypatch, "invt-goodrive")
+def test_jog_that_continues_after_a_stop_is_ended_by_stop_jog() -> None:
+    line = Line("invt-goodrive")
     line.sim.jog_needs_own_stop = True
     line.drive.option["stop_time"] = 3.0
     line.drive.jog()
@@ -271,11 +271,9 @@ def test_jog_that_continues_after_a_stop_is_ended_by_stop_jog(monkeypatch: pytes
 
 
 @pytest.mark.parametrize("is_refused", [False, True], ids=["not heard", "refused"])
-def test_stop_jog_is_sent_after_an_unconfirmed_stop(
-    monkeypatch: pytest.MonkeyPatch, is_refused: bool
-) -> None:
+def test_stop_jog_is_sent_after_an_unconfirmed_stop(is_refused: bool) -> None:
     """The replies to the stop are lost, as with a broken wire, or the drive refuses a stop during a jog."""
-    line = Line(monkeypatch, "invt-goodrive")
+    line = Line("invt-goodrive")
     line.sim.jog_needs_own_stop = True
     line.drive.jog()
     assert line.sim.motor.goal
@@ -297,7 +295,7 @@ def test_stop_jog_is_sent_after_an_unconfirmed_stop(
 
 
 def test_stop_jog_is_not_sent_to_a_drive_of_another_make(monkeypatch: pytest.MonkeyPatch) -> None:
-    line = Line(monkeypatch, "invt-goodrive")
+    line = Line("invt-goodrive")
     checked: list[Drive] = []
 
     def withhold(drive: Drive, *word: object) -> None:
@@ -311,8 +309,8 @@ def test_stop_jog_is_not_sent_to_a_drive_of_another_make(monkeypatch: pytest.Mon
     assert line.writes == []
 
 
-def test_start_of_a_cia402_drive_without_mains_voltage_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    line = Line(monkeypatch, "schneider-atv320")
+def test_start_of_a_cia402_drive_without_mains_voltage_is_refused() -> None:
+    line = Line("schneider-atv320")
     line.drive.set_frequency(20)
     line.sim.stays_off = True
     with pytest.raises(NotVerified, match="not switched on"):
@@ -321,10 +319,8 @@ def test_start_of_a_cia402_drive_without_mains_voltage_is_refused(monkeypatch: p
 
 
 @pytest.mark.parametrize("name", ["off2", "off3"])
-def test_start_of_a_profidrive_during_off2_or_off3_is_refused(
-    name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    line = Line(monkeypatch, "abb-acs355")
+def test_start_of_a_profidrive_during_off2_or_off3_is_refused(name: str) -> None:
+    line = Line("abb-acs355")
     line.drive.set_frequency(20)
     setattr(line.sim, name, True)
     with pytest.raises(WriteForbidden, match=f"{name.upper()}.* is active from elsewhere"):
@@ -335,18 +331,16 @@ def test_start_of_a_profidrive_during_off2_or_off3_is_refused(
     assert line.sim.motor.energised
 
 
-def test_off2_from_a_terminal_during_a_run_is_reported_and_not_overridden(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    line = Line(monkeypatch, "siemens-v20")
+def test_off2_from_a_terminal_during_a_run_is_reported_and_not_overridden() -> None:
+    line = Line("siemens-v20")
     line.runs()
     line.drive.write(line.drive.control, line.drive.control.decode(0x047C))
     assert not line.sim.motor.energised
     assert line.drive.state().condition is Condition.STOPPED
 
 
-def test_reset_of_a_trip_that_only_a_power_cycle_clears_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    line = Line(monkeypatch, "danfoss-fc51")
+def test_reset_of_a_trip_that_only_a_power_cycle_clears_is_refused() -> None:
+    line = Line("danfoss-fc51")
     line.sim.trip(FAULT)
     line.sim.is_locked = True
     with pytest.raises(WriteForbidden, match="take its mains away"):
@@ -356,10 +350,8 @@ def test_reset_of_a_trip_that_only_a_power_cycle_clears_is_refused(monkeypatch: 
     line.runs()
 
 
-def test_start_of_an_optidrive_as_its_first_guide_describes_it_is_refused(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    line = Line(monkeypatch, "optidrive-e3")
+def test_start_of_an_optidrive_as_its_first_guide_describes_it_is_refused() -> None:
+    line = Line("optidrive-e3")
     line.sim.is_first_reading = True
     line.drive.set_frequency(20)
     with pytest.raises(WriteForbidden, match="not ready to run"):
@@ -383,10 +375,10 @@ OF_ANOTHER = {
 @table("first", OF_ANOTHER)
 @table("second", OF_ANOTHER)
 def test_stop_is_withheld_only_if_status_and_a_second_value_show_another_make(
-    monkeypatch: pytest.MonkeyPatch, first: str, second: str
+    first: str, second: str
 ) -> None:
     """One make's stop word may run another make's motor. One value, or two settings, prove nothing."""
-    line = Line(monkeypatch, "abb-acs355")
+    line = Line("abb-acs355")
     shown = {line.drive.register(name).address: OF_ANOTHER[name] for name in (first, second)}
 
     def show(request: Message) -> bytes | None:
@@ -405,8 +397,8 @@ def test_stop_is_withheld_only_if_status_and_a_second_value_show_another_make(
         assert line.writes == []
 
 
-def test_stop_of_a_drive_that_was_once_identified_is_always_sent(monkeypatch: pytest.MonkeyPatch) -> None:
-    line = Line(monkeypatch, "invt-goodrive")
+def test_stop_of_a_drive_that_was_once_identified_is_always_sent() -> None:
+    line = Line("invt-goodrive")
     line.runs()
     line.sim["device"] = 0
     line.drive.stop()

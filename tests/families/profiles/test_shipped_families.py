@@ -365,11 +365,11 @@ def test_every_register_of_a_family_file_names_a_page_of_a_listed_manual(name: s
         assert any(edition in register.place for edition in EDITIONS[name]), (register.name, register.place)
 
 
-def test_family_of_the_pump_controller_has_no_commands(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_family_of_the_pump_controller_has_no_commands() -> None:
     family = shipped_family("erman-er-g-220-03")
     assert {register.access for register in family.registers.values()} == {Access.READING}
     assert "confirmed" not in family.options
-    bus, drive, sim = (SimulatedBus(monkeypatch, sim := simulated(family(63))), family(63), sim)
+    bus, drive, sim = (SimulatedBus(sim := simulated(family(63))), family(63), sim)
     bus.attach(drive)
     for call in (drive.start, drive.stop, drive.reset_fault, lambda: drive.set_frequency(20), drive.state):
         with pytest.raises(Unsupported):
@@ -384,11 +384,9 @@ def test_family_of_the_pump_controller_has_no_commands(monkeypatch: pytest.Monke
 
 
 @every_commanded_family
-def test_untested_family_sends_no_command_except_a_stop_before_confirmation(
-    name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_untested_family_sends_no_command_except_a_stop_before_confirmation(name: str) -> None:
     family = shipped_family(name)
-    bus, drive, _ = one(monkeypatch, family(1))
+    bus, drive, _ = one(family(1))
     for call in (lambda: drive.set_frequency(20), drive.start, drive.reset_fault):
         with pytest.raises(WriteForbidden, match=rf"multidrop check {name}` .*confirmed = 1"):
             call()

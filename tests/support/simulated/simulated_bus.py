@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
-import pytest
 from batches import completed
 
 from multidrop import bus
@@ -29,6 +29,9 @@ EXCHANGE_TIME = 0.02  # duration of an exchange in s
 TIMEOUT = 0.3
 
 READING = {1, 2, 3, 4}
+REPLACED = [(bus, "Line"), (peers, "_former")]
+REPLACED += [(clock, name) for name in ("sleep", "now_ns", "boottime_ns", "utc_minus_monotonic_ns")]
+
 QUERYING = {3, 7}  # functions of Delixi's own protocol that only read
 
 
@@ -37,13 +40,23 @@ def text(frame: bytes) -> str:
     return frame.decode().strip() if frame.startswith(b":") else frame.hex(" ").upper()
 
 
+@contextmanager
+def real_clock() -> Iterator[None]:
+    """Restore everything that a `SimulatedBus` replaces."""
+    kept = [getattr(module, name) for module, name in REPLACED]
+    yield
+    for (module, name), value in zip(REPLACED, kept, strict=True):
+        setattr(module, name, value)
+
+
 class SimulatedBus:
     """Simulated drives and a `Bus` to them; every sent frame is recorded.
 
     If `loses(request)` is true, the reply is lost; if `deafens(request)` is true, the request is lost.
+    It replaces the clock and the line of `Bus`; `real_clock` restores them.
     """
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, *sims: SimulatedDrive, **details: Any) -> None:
+    def __init__(self, *sims: SimulatedDrive, **details: Any) -> None:
         self.sims = sims
         self.seconds = 1000.0
         self.slept = 0.0  # s of system suspend, which CLOCK_MONOTONIC does not count
@@ -56,12 +69,16 @@ class SimulatedBus:
         self.queue = object()  # as long as this is not None, the port counts as open
         self.has_echo = False
         self.port = self.identity = "hall"
-        monkeypatch.setattr(bus, "Line", lambda port, *facts: self)
-        monkeypatch.setattr(peers, "_former", {})  # forget timing that was learnt on another clock
-        monkeypatch.setattr(clock, "sleep", self.sleep)
-        monkeypatch.setattr(clock, "now_ns", lambda: round(self.seconds * 1e9))
-        monkeypatch.setattr(clock, "boottime_ns", lambda: round((self.seconds + self.slept) * 1e9))
-        monkeypatch.setattr(clock, "utc_minus_monotonic_ns", lambda: 1_700_000_000 * 10**9)
+        replacements = (  # in the order of REPLACED
+            lambda port, *facts: self,
+            {},  # forget timing that was learnt on another clock
+            self.sleep,
+            lambda: round(self.seconds * 1e9),
+            lambda: round((self.seconds + self.slept) * 1e9),
+            lambda: 1_700_000_000 * 10**9,
+        )
+        for (module, name), replacement in zip(REPLACED, replacements, strict=True):
+            setattr(module, name, replacement)
         self.bus = bus.Bus("hall", **details)
 
     def sleep(self, seconds: float) -> None:
@@ -152,11 +169,9 @@ def is_write(request: Message) -> bool:
     return request.function not in READING
 
 
-def one(
-    monkeypatch: pytest.MonkeyPatch, drive: Drive, **details: Any
-) -> tuple[SimulatedBus, Any, MotorDrive]:
+def one(drive: Drive, **details: Any) -> tuple[SimulatedBus, Any, MotorDrive]:
     """Return a simulated bus with one drive, that drive, and its simulation."""
     sim = simulated(drive)
     assert isinstance(sim, MotorDrive)
-    bus = SimulatedBus(monkeypatch, sim, **details)
+    bus = SimulatedBus(sim, **details)
     return bus, bus.attach(drive), sim

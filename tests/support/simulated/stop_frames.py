@@ -7,7 +7,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import pytest
 from motors import MAKE, STARTS
 from simulated_bus import SimulatedBus, is_write, one
 
@@ -108,14 +107,14 @@ class Meanwhile:
 
 
 def che_drives(
-    monkeypatch: pytest.MonkeyPatch, count: int = 1, *, hz: float = 20, runs_s: float | None = None
+    count: int = 1, *, hz: float = 20, runs_s: float | None = None
 ) -> tuple[SimulatedBus, list[Any], list[Any]]:
     """Return a simulated bus, its CHE drives, whose setpoints are written, and their simulations.
 
     If `runs_s` is given, all motors have been running for this many seconds.
     """
     sims: list[Any] = [simulated(InvtCHE(address, maximum_frequency=50)) for address in range(1, count + 1)]
-    line = SimulatedBus(monkeypatch, *sims)
+    line = SimulatedBus(*sims)
     drives: list[Any] = [line.attach(sim.drive) for sim in sims]
     for drive in drives:
         drive.set_frequency(hz)
@@ -132,17 +131,13 @@ def plain_stop(drive: Drive) -> tuple[Any, Any]:
 
 
 def started_while(
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-    model: str,
-    frames: int,
-    act: Callable[[SimulatedBus, Any], object],
+    tmp_path: Path, model: str, frames: int, act: Callable[[SimulatedBus, Any], object]
 ) -> tuple[SimulatedBus, Any, Meanwhile, int, BaseException | None]:
     """Start a drive while another thread acts after `frames` frames.
 
     Returns the bus, the drive, the action, the number of frames before the start, and its error or None.
     """
-    line, drive, _ = one(monkeypatch, MAKE[model](1), ledger=tmp_path / f"wear-{frames}")
+    line, drive, _ = one(MAKE[model](1), ledger=tmp_path / f"wear-{frames}")
     drive.set_frequency(20)
     begun = len(line.frames)
     meanwhile = Meanwhile(line, frames, lambda: act(line, drive))
