@@ -305,9 +305,6 @@ def test_captured_frames_have_correct_times_after_clock_changes() -> None:
     assert found == [*asked, driver.now + 5 * HOUR_NS]
 
 
-# ---- the flight recorder ----
-
-
 class Flight:
     """A flight recorder on a clock that the test sets."""
 
@@ -414,9 +411,6 @@ def test_a_flight_recorder_in_an_impossible_directory_raises_one_sentence(tmp_pa
         FlightRecorder(tmp_path / "file" / "flights", [])
 
 
-# ---- what counts as an anomaly ----
-
-
 class Watched:
     """A drive, its line with a clock that the test sets, and the line's AnomalyWatch."""
 
@@ -476,9 +470,6 @@ def test_a_lost_port_causes_one_anomaly() -> None:
         assert list(pump.watch.check()) == []
         pump.port = open_port
         assert list(pump.watch.check()) == []
-
-
-# ---- on the command line ----
 
 
 @pytest.mark.slow

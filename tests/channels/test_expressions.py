@@ -172,8 +172,6 @@ def test_values_are_converted_between_units_by_the_expected_factor(
     assert unit_of(one).factor / unit_of(other).factor == pytest.approx(factor, rel=1e-12)
 
 
-# ---- any text ----
-
 WORDS = (
     *(
         "pump-1.current",

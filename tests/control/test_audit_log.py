@@ -122,9 +122,6 @@ def test_a_write_that_is_interrupted_or_fails_is_recorded(
     assert (record["write"], record["outcome"], bool(record["why"])) == (what, "unconfirmed", True)
 
 
-# ---- authors ----
-
-
 Noted = list[tuple[str, str | None, str | None]]
 
 

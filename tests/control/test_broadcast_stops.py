@@ -322,9 +322,6 @@ def test_notes_of_an_interrupted_stop_all_count_the_broadcast_stop() -> None:
     assert {*interruption.value.__notes__} == {f"invt-che@1: {told}", f"invt-che@2: {told}"}
 
 
-# ---- a stop of all drives ----
-
-
 def test_only_stops_and_zero_setpoints_are_broadcast_and_to_one_family_only() -> None:
     sims = [simulated(InvtCHE(1)), simulated(InvtCHE(2))]
     line = SimulatedBus(*sims)

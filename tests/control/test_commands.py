@@ -47,7 +47,6 @@ from multidrop.supervisor import Supervisor
 STANDS = CommandResult(CommandOutcome.DONE, "it stands")
 UNKNOWN = CommandResult(CommandOutcome.UNKNOWN, "it is not seen to stand")
 
-# ---- results ----
 
 Stop = Callable[[InnovertIBD], Results]
 STOPS: dict[str, Stop] = {
@@ -112,9 +111,6 @@ def test_a_write_returns_a_result_and_never_raises(value: Any, outcome: CommandO
     assert result.outcome is outcome, result
     assert result.text.startswith(text)
     assert (result.error is None) == result.ok
-
-
-# ---- threads ----
 
 
 class Threads(Supervisor):
@@ -227,9 +223,6 @@ async def test_a_stop_without_threads_continues_if_its_caller_is_cancelled(threa
     while len(motors.noted) < 2:
         await asyncio.sleep(0.01)
     assert motors.noted == [("a", 0.0), ("a", TURN_S)]
-
-
-# ---- stops that many clients call ----
 
 
 SILENT = CommandResult(CommandOutcome.UNKNOWN, "no reply")

@@ -406,8 +406,6 @@ def test_a_signal_immediately_prints_which_drives_are_being_stopped(
     until(lambda: caught)
 
 
-# ---- in processes ----
-
 CLIENT = """
 import sys, time
 from contextlib import ExitStack

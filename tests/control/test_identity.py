@@ -242,9 +242,6 @@ def test_missed_polls_count_as_silence() -> None:
     assert received.writes == []
 
 
-# ---- drives that were detached and attached again ----
-
-
 def test_a_detached_drive_is_identified_again_before_a_start() -> None:
     bus, drive, sim = one(InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(10)
@@ -280,9 +277,6 @@ def test_detaching_a_drive_forgets_that_its_identity_check_failed() -> None:
             check.check_before_stop(drive, drive.control, 5)
         bus.bus.detach(drive)
         bus.attach(drive)
-
-
-# ---- the checks themselves ----
 
 
 class Mute(Drive):
@@ -367,9 +361,6 @@ def test_a_drive_that_answered_recently_is_not_identified_again(share: float, lo
     drive.set_frequency(20)
     asked = [is_write(request) for request, _ in bus.frames[begun:]]
     assert asked[: looks + 1] == [False] * looks + [True]
-
-
-# ---- before a stop ----
 
 
 REFUSALS = [

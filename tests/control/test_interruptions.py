@@ -89,9 +89,6 @@ def test_an_interrupted_exchange_does_not_delay_the_next_exchange(monkeypatch: p
     assert nth > 8
 
 
-# ---- interrupted stops and starts ----
-
-
 # families whose stop has two writes: the second withdraws START, or ends a jog
 OF_TWO_WRITES = ("erman-er-g-220", "invt-che")
 

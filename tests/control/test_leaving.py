@@ -150,13 +150,10 @@ def test_a_bus_with_stop_on_exit_can_only_be_made_on_the_main_thread(monkeypatch
     closed: list[bool] = []
     monkeypatch.setattr(SimulatedBus, "close", lambda self: closed.append(True))
     with ThreadPoolExecutor(1) as threads:
-        made = threads.submit(SimulatedBus, monkeypatch, simulated(InvtCHE(1)), stop_on_exit=True)
+        made = threads.submit(SimulatedBus, simulated(InvtCHE(1)), stop_on_exit=True)
         with pytest.raises(ValueError, match="main thread"):
             made.result()
     assert closed
-
-
-# ---- one bus at a time ----
 
 
 def test_attaching_a_drive_of_another_open_bus_raises() -> None:
@@ -247,9 +244,6 @@ def test_threads_that_attach_concurrently_add_one_drive_at_a_time(monkeypatch: p
         for drive in line.bus.drives:
             line.bus.detach(drive)
     assert most == 1
-
-
-# ---- latches ----
 
 
 def test_a_thread_does_not_wait_for_its_own_interrupted_stop() -> None:

@@ -40,9 +40,6 @@ def write(port: str, seconds: float, ledger: Ledger | None = None) -> None:
         toy.write(toy.acceleration_time, seconds)
 
 
-# ---- identities of ports ----
-
-
 @pytest.mark.slow
 def test_all_paths_of_a_port_share_one_eeprom_write_a_minute(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -148,9 +145,6 @@ def test_ledger_entries_of_older_versions_count_for_the_same_port(old: str, spel
             assert [(each.cell.port, each.writes) for each in ledger.wear(1003.0)] == [(now, 3)]
 
 
-# ---- writes that wear an EEPROM ----
-
-
 def test_registers_in_ram_are_not_counted(tmp_path: Path) -> None:
     class Fan(Drive):
         """A user's own drive."""
@@ -171,8 +165,6 @@ def test_registers_in_ram_are_not_counted(tmp_path: Path) -> None:
     assert [each.cell.register for each in ledger.wear(0)] == ["latch"]
     assert set(sim.counters.eeprom_writes) == {"known", "latch"}  # `ram` is unknown to the simulation
 
-
-# ---- simulated drives ----
 
 with_names = pytest.mark.skipif(sys.platform != "linux", reason="this system has no names for it")
 

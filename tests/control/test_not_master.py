@@ -233,9 +233,6 @@ def test_commands_can_be_sent_after_the_mastership_returns(scene: Scene) -> None
     assert scene.requests > 0
 
 
-# ---- the mastership ends in the middle of a call ----
-
-
 def hold_back(monkeypatch: pytest.MonkeyPatch, scene: Scene, *, sent_ns: int, after: int) -> None:
     """After `after` writes, refuse each write as NOT_MASTER; sent in part if `sent_ns` is not 0."""
     carry_out, writes = scene.bus.line.carry_out, count()
@@ -294,9 +291,6 @@ def test_a_sent_stop_is_unconfirmed_if_the_mastership_ends(
     found = scene.bus.stop_all()["pump"]
     assert found.seen is not Seen.FAILED
     assert "NOT sent" not in found.why
-
-
-# ---- another master ----
 
 
 @pytest.fixture
@@ -431,9 +425,6 @@ def test_network_ports_send_nothing_without_mastership(port: str) -> None:
         with pytest.raises(NotMaster):
             drive.read(Toy.output_current)
         assert sim.counters.requests == asked > 0
-
-
-# ---- invalid ports and arguments ----
 
 
 def test_only_the_master_opens_the_port(scene: Scene) -> None:

@@ -29,8 +29,6 @@ from multidrop.families import YD1000, DelixiModbus, InnovertIBD, InvtCHE
 from multidrop.sim import simulated
 from multidrop.transport import clock
 
-# ---- ramps ----
-
 
 def steps(line: SimulatedBus) -> list[int]:
     """Return the raw counts of the setpoints that were written."""
@@ -141,9 +139,6 @@ def test_a_ramp_of_an_unconfirmed_drive_is_refused() -> None:
     line, drive, _ = ramped(Nameless, confirmed=1)
     ramp(drive, 2.0, rate=1.0, every=1.0)
     assert steps(line) == [100, 200]
-
-
-# ---- staggered starts ----
 
 
 @pytest.mark.parametrize("gap", [0, 0.5])
@@ -308,9 +303,6 @@ def test_interrupted_stops_without_threads_are_each_sent_once_more(monkeypatch: 
     with pytest.raises(KeyboardInterrupt):
         start_staggered(drives, 1.0)
     assert noted.calls == [(1, 0.0), (2, 0.0), (1, None), (1, 0.0), (2, 0.0)]
-
-
-# ---- setpoints and limits of a ramp ----
 
 
 def test_a_failed_staggered_start_stops_the_drives_it_started() -> None:

@@ -39,9 +39,6 @@ from multidrop.transport.exchange import READ_ATTEMPTS
 every_family = pytest.mark.parametrize("model", MAKE)
 
 
-# ---- rules ----
-
-
 @every_family
 def test_a_plain_write_never_starts_a_motor_nor_resets_a_fault(model: str) -> None:
     line, drive, sim = one(MAKE[model](1))
@@ -136,9 +133,6 @@ def test_a_raw_request_bypasses_all_rules_and_errors_name_it_as_raw() -> None:
     assert len(line.written) == 2  # each call sent the request once
 
 
-# ---- identity ----
-
-
 @every_family
 def test_only_the_first_write_is_preceded_by_an_identity_check(
     monkeypatch: pytest.MonkeyPatch, model: str
@@ -172,9 +166,6 @@ def test_an_unidentified_innovert_ibd_needs_confirmed_for_writes() -> None:
             with pytest.raises(WriteForbidden, match="confirmed = 1"):
                 drive.set_frequency(20)
             assert line.written == []
-
-
-# ---- outcomes ----
 
 
 def test_try_write_reports_done_taken_as_or_unconfirmed() -> None:
@@ -291,9 +282,6 @@ def test_an_unsent_write_is_not_reported_as_unconfirmed(
     assert line.written == []
 
 
-# ---- faults on the way ----
-
-
 def test_an_exception_to_a_read_after_a_start_raises_unconfirmed() -> None:
     """Raising DriveException would mean that the drive refused the start."""
     line, drive, sim = one(InvtCHE(1, maximum_frequency=50))
@@ -390,9 +378,6 @@ def test_a_setpoint_that_the_drive_limits_is_reported_with_the_limited_value(
     assert line.written == ["01 06 00 02 01 C2 A8 0B"]
 
 
-# ---- EEPROM ----
-
-
 @pytest.mark.slow
 def test_a_setpoint_loop_to_eeprom_is_refused_with_advice() -> None:
     line, drive, sim = one(DelixiModbus(1))
@@ -444,9 +429,6 @@ def test_a_write_through_a_ram_alias_is_not_counted_as_an_eeprom_write(tmp_path:
     assert line.written == ["01 06 80 0C 00 C8 61 9F"]
     assert not sim.counters.eeprom_writes
     assert ledger.wear(0) == []
-
-
-# ---- the watchdog, identity checks of own families ----
 
 
 def test_the_drives_watchdog_setting_is_read_if_it_is_readable() -> None:

@@ -31,9 +31,6 @@ from multidrop.transport.aside_log import flush
 every_family = pytest.mark.parametrize("model", MAKE)
 
 
-# ---- against earlier calls ----
-
-
 ACTS: dict[str, Callable[[SimulatedBus, Any], object]] = {
     "stop": lambda line, drive: drive.stop(),
     "stop_all": lambda line, drive: line.bus.stop_all(),
@@ -149,9 +146,6 @@ def test_no_call_moves_a_motor_after_the_bus_is_closed() -> None:
         with pytest.raises(CancelledByStop, match="the bus was left"):
             call()
     assert writes(line, begun) == []
-
-
-# ---- repeated until the motor is at rest ----
 
 
 @every_family
@@ -402,9 +396,6 @@ def test_a_stop_on_a_closed_port_raises_immediately() -> None:
     assert line.seconds - begun < 0.1
 
 
-# ---- a user's own drive ----
-
-
 def test_a_stop_is_sent_although_the_ledger_cannot_be_written(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -508,9 +499,6 @@ def test_a_stop_that_is_one_plain_write_is_repeated_until_the_drive_answers() ->
     assert len(writes(line)) > 3
 
 
-# ---- one drive, one bus ----
-
-
 class Hanging(logging.Handler):
     """A log handler that hangs, as on a hung disk."""
 
@@ -548,9 +536,6 @@ def test_a_stop_is_sent_even_if_a_log_handler_hangs(monkeypatch: pytest.MonkeyPa
         released.set()
         logging.getLogger("multidrop").removeHandler(handler)
         line.bus.close()
-
-
-# ---- the progress of a stop ----
 
 
 def noting(line: SimulatedBus) -> list[str]:

@@ -168,9 +168,6 @@ def test_with_an_invalid_time_limit_only_a_stop_is_sent(limit: Any) -> None:
     assert len(written(line)) == 1
 
 
-# ---- a bus's own expiry ----
-
-
 def check_not_sent(tmp_path: Path, model: str, hold_up: Callable[[SimulatedBus], None]) -> None:
     """Check that a start delayed at any of its reads is not sent."""
     for frames in range(1, 100):

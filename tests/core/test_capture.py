@@ -240,9 +240,6 @@ def test_the_framing_of_each_frame_is_detected() -> None:
     ]
 
 
-# ---- interruptions ----
-
-
 def test_an_interrupted_decoder_reads_no_freed_memory() -> None:
     """After an interruption, the decoder decodes the file's next bytes. A memory sanitizer checks this."""
 

@@ -295,9 +295,6 @@ def test_a_code_without_a_name_raises() -> None:
         spell(memoryview(array("H", [0, 1])), Names(["pump"]))
 
 
-# ---- narrow columns of recordings ----
-
-
 EDGES = [0, 1, -1, 2**24, 2**24 + 1, 2**53 + 1, 2**63 - 1, -(2**63), -(2**63) + 1, 2**63 - 2**38]
 
 

@@ -345,9 +345,6 @@ def test_the_exit_of_a_child_does_not_stop_the_parents_motor(end: str) -> None:
         assert (start, stops[0], set(stops) - {5, 8}) == (1, 5, set())
 
 
-# ---- interpreters ----
-
-
 CODE = """
 try:
     import _interpreters as interpreters

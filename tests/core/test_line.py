@@ -84,9 +84,6 @@ def exchanged(line: LineDriver, received: bytes, request: Message = READ, piece:
     return line.completion
 
 
-# ---- silence ----
-
-
 def test_the_time_of_a_value_is_never_after_its_reply(line: LineDriver) -> None:
     """The thread may notice late that the request was sent, because writing to the port blocked it."""
     line.begin(exchange(READ))
@@ -212,9 +209,6 @@ def test_silence_starts_after_the_requests_last_bit(line: LineDriver) -> None:
     assert line.now == sent + 8 * CHARACTER + SILENCE
 
 
-# ---- sending ----
-
-
 def test_a_request_is_sent_in_parts_if_the_port_accepts_only_a_few_bytes_at_once(line: LineDriver) -> None:
     line.begin(exchange(READ))
     line.now += SILENCE
@@ -281,9 +275,6 @@ def test_a_failed_port_ends_the_exchange_as_line_lost(line: LineDriver, step: st
     assert found.raw == (b"\x01\x03" if step == "listening" else b"")
     line.lose(errno.ENODEV)  # no exchange is in flight
     assert line.completion.error == errno.EIO
-
-
-# ---- the reply ----
 
 
 @pytest.mark.parametrize("piece", [7, 3, 1])
@@ -418,9 +409,6 @@ def test_the_result_at_the_timeout_gives_the_reason(
     assert found.reply == Message(0, 0)
 
 
-# ---- late replies, doubled replies, noise ----
-
-
 def test_a_late_reply_is_discarded_before_the_next_request(line: LineDriver) -> None:
     ask(line)
     line.wait_until_done()
@@ -475,9 +463,6 @@ def test_a_search_in_endless_garbage_keeps_less_than_a_frame_of_bytes(
     assert (found.skipped, found.raw) == (len(garbage), garbage[-513:])
 
 
-# ---- broadcasts ----
-
-
 def test_a_broadcast_ends_when_it_is_sent_and_the_turnaround_delay_follows(line: LineDriver) -> None:
     ask(line, BROADCAST)
     sent = line.now
@@ -506,9 +491,6 @@ def test_a_failed_unsent_exchange_does_not_cancel_the_turnaround_delay(line: Lin
     line.begin(exchange(READ))
     line.wait_until_write()
     assert line.now == sent + 8 * CHARACTER + TURNAROUND
-
-
-# ---- an adapter that echoes what it sends ----
 
 
 def teach_echo(line: LineDriver) -> None:

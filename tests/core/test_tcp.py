@@ -49,9 +49,6 @@ def tcp(transaction: int, body: bytes) -> bytes:
     return transaction.to_bytes(2) + b"\0\0" + len(body).to_bytes(2) + body
 
 
-# ---- frames ----
-
-
 def test_printed_tcp_frames_are_built_and_parsed() -> None:
     read = Message(0xFF, 3, 4, 1, transaction=0x1501)
     assert build_request(TCP, read) == bytes.fromhex(GUIDE)
@@ -143,9 +140,6 @@ def test_the_longest_tcp_frame_is_built_and_parsed() -> None:
 )
 def test_a_damaged_tcp_reply_has_the_expected_fault(damaged: str, fault: FrameFault) -> None:
     assert parse_reply(TCP, bytes.fromhex(damaged), READ) == (fault, None)
-
-
-# ---- exchanges ----
 
 
 @pytest.fixture
@@ -306,9 +300,6 @@ def test_an_exchange_with_a_wrong_reply_of_its_id_ends_at_the_timeout(
     assert line.completion.raw == tcp(transaction, body)
 
 
-# ---- devices with wrong lengths in their headers ----
-
-
 def odd(transaction: int, body: bytes, length: int) -> bytes:
     """Return a frame whose header states another length."""
     return transaction.to_bytes(2) + b"\0\0" + length.to_bytes(2) + body
@@ -454,9 +445,6 @@ def test_every_exchange_ends_whatever_bytes_come(pieces: list[bytes], transactio
         line.wait_until_done()
 
 
-# ---- gateways with ids of their own ----
-
-
 @pytest.fixture
 def gateway() -> LineDriver:
     return LineDriver(Transactions.IGNORED)
@@ -491,9 +479,6 @@ def test_if_ids_are_ignored_a_drive_may_reply_after_a_gateways_exception(
     gateway.receive(tcp(ask(gateway, drive), bytes([1, 0x83, 0x0B])))
     assert gateway.completion.result == Failure.NO_REPLY
     assert drive.late_until_ns > gateway.now
-
-
-# ---- a connection ----
 
 
 @pytest.fixture

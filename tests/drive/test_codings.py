@@ -205,9 +205,6 @@ def test_float_written_to_a_drive_is_read_back_unchanged(
     assert register.encode(register.parse(register.format(raw).removesuffix(" m"))) == raw
 
 
-# ---- parts of a word ----
-
-
 @dataclass
 class Bits:
     number_format: NumberFormat
@@ -275,9 +272,6 @@ def test_a_range_of_bits_in_a_register_can_be_an_enumeration() -> None:
     sim = SimulatedDrive(family(1))
     sim["phase"], sim["alarms"] = Phase.HEATING, Alarm.SENSOR
     assert sim.read(4, 7, 1) == [0x0250]
-
-
-# ---- no value ----
 
 
 @pytest.mark.slow
@@ -366,9 +360,6 @@ def test_bus_raises_no_value_when_a_drive_returns_an_invalid_raw_count() -> None
     assert sim["limit"] == 7
 
 
-# ---- a scale register ----
-
-
 @settings(max_examples=examples(300))
 @given(
     st.sampled_from([NumberFormat.U16, NumberFormat.I16, NumberFormat.U32, NumberFormat.I32]),
@@ -417,9 +408,6 @@ def test_value_is_multiplied_by_the_power_of_ten_in_its_scale_register(
     assert [place.at for place in places if place.name == "level"] == [10 - start]
     apart = known.find(Framing.RTU, Message(1, 4, 10, size // 2)).places
     assert "level" not in [place.name for place in apart]  # a reply without the scale register gives no value
-
-
-# ---- into a recording ----
 
 
 @pytest.mark.slow

@@ -332,8 +332,6 @@ def test_register_access_that_its_table_does_not_allow_is_reported() -> None:
     assert HOLDING.read == 3
 
 
-# ---- line settings, manual references, verbs ----
-
 WRONG_FACTS: list[tuple[str, Any, str]] = [
     ("silence", "x", "silence = 'x' is not a number of s from 0 to 1"),
     ("silence", 20, "silence = 20 is not a number of s from 0 to 1"),

@@ -201,9 +201,6 @@ def test_number_without_a_known_scale_is_formatted_with_all_its_digits(value: fl
     assert value_text(Meter.unscaled, value) == text
 
 
-# ---- common in devices ----
-
-
 def test_register_of_several_words_is_read_without_a_stated_read_limit(attached: Any) -> None:
     _, meter, sim = attached
     sim["total"] = 0x12345

@@ -226,9 +226,6 @@ def test_folder_without_register_templates_is_reported(tmp_path: Path, folder: s
     assert sentence in done.stderr
 
 
-# ---- texts of one character a register ----
-
-
 def test_template_text_with_one_character_per_register_uses_the_low_bytes() -> None:
     version = text(250, 5, order="B")
     assert version.decode(bytes.fromhex("0034 002E 0031 0000 0041")) == "4.1"

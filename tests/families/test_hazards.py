@@ -364,9 +364,6 @@ def test_low_byte_of_a_yd1000_checksum_is_sent_first_erratum_y2() -> None:
     assert line.written[-1] == "01 06 10 00 C4 00 DF CA"
 
 
-# ---- errata that concern reads ----
-
-
 def reply_to(request: Message, frame: str) -> tuple[int, Message | None]:
     return parse_reply(Framing.RTU, bytes.fromhex(frame), request)
 
@@ -544,9 +541,6 @@ def test_registers_kept_in_eeprom_are_declared_as_eeprom_erratum_0_8() -> None:
         assert (register.kept is Kept.EEPROM) == (not in_ram) or register.access.value == "reading"
 
 
-# ---- adapters with an echo ----
-
-
 def test_echo_of_an_adapter_is_not_accepted_as_a_drive_erratum_0_3() -> None:
     """If only copies of the requests arrive, no read gets a valid reply, and no write is sent."""
     line = SimulatedBus()
@@ -557,8 +551,6 @@ def test_echo_of_an_adapter_is_not_accepted_as_a_drive_erratum_0_3() -> None:
                 drive.perform(script)
     assert line.written == []
 
-
-# ---- completeness ----
 
 FAMILIES = {"E": 18, "I": 6, "N": 10, "D": 17, "Y": 15}
 OF_PRINT_ALONE = {

@@ -210,8 +210,6 @@ def test_stop_is_sent_although_a_gateway_answers_ffff_for_the_drive(declared: st
     assert bus.written
 
 
-# ---- a scan ----
-
 SCANNED = [*MODELS.values(), *map(shipped_family, RECOGNISABLE)]
 
 

@@ -201,9 +201,6 @@ def test_requested_buckets_of_2_s_or_more_use_the_ten_second_summaries() -> None
     assert grid_of(*hour, 1801).step < 2 * SECOND
 
 
-# ---- while the history is recorded ----
-
-
 @pytest.mark.long
 def test_a_reader_sees_new_rows_exactly_once(tmp_path: Path) -> None:
     pytest.importorskip("duckdb", reason="needs duckdb")

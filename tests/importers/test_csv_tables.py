@@ -24,9 +24,6 @@ def found(device: ImportedDevice) -> list[str]:
     return [gap for gap in gaps(device, "a") if gap not in UNPLACED]
 
 
-# ---- addresses and tables ----
-
-
 @table(
     ("header", "cells", "at", "table", "gap"),
     [
@@ -91,9 +88,6 @@ def test_unit_of_a_coil_in_a_csv_table_is_left_out_and_marked_as_a_gap(tmp_path:
     assert found(device) == ["its type, unit and scale were left out: a coil is a bit"]
 
 
-# ---- step and offset ----
-
-
 @table(
     ("header", "cell", "step", "gap"),
     [
@@ -139,9 +133,6 @@ def test_second_scale_column_of_a_csv_table_is_marked_as_a_gap(tmp_path: Path) -
 def test_offset_together_with_a_scale_column_is_marked_as_a_gap(tmp_path: Path) -> None:
     device = row(tmp_path, "address,type,scale,offset", "0x10,uint16,0.1,-40")
     assert found(device) == ["its offset -40 was taken as added after the step"]
-
-
-# ---- types ----
 
 
 @table(
@@ -204,8 +195,6 @@ def test_ambiguous_byte_order_in_a_csv_table_is_marked_as_a_gap(
     assert (entries(device)["a"].get("order"), found(device)) == (order, [gap] if gap else [])
 
 
-# ---- read and write access ----
-
 WRITTEN = ["it is written there; what a write does is not known here"]
 
 
@@ -233,9 +222,6 @@ def test_csv_row_with_a_writing_function_code_is_marked_as_written(tmp_path: Pat
     assert found(row(tmp_path, "address,type,fc", '0x10,uint16,"03,06,16"')) == WRITTEN
     with pytest.raises(ValueError, match="a: is only written"):
         row(tmp_path, "address,type,fc", "0x10,uint16,16")
-
-
-# ---- columns and files ----
 
 
 def test_csv_columns_that_are_not_imported_are_reported(tmp_path: Path) -> None:
@@ -274,9 +260,6 @@ def test_unit_ids_0_and_255_in_a_csv_table_are_valid_addresses(tmp_path: Path, u
 def test_invalid_csv_table_raises_value_error_with_the_reason(tmp_path: Path, text: str, reason: str) -> None:
     with pytest.raises(ValueError, match=re.escape(reason)):
         only(tmp_path, "t.csv", text)
-
-
-# ---- modpoll ----
 
 
 def test_missing_modpoll_byte_order_defaults_to_be_le_and_is_marked_as_a_gap(tmp_path: Path) -> None:

@@ -101,8 +101,6 @@ def test_esphome_entity_with_custom_command_is_reported_as_not_imported(tmp_path
         entity(tmp_path, "custom_command: [1, 3]")
 
 
-# ---- devices ----
-
 ONE = "{{platform: modbus_controller, {}name: {}, register_type: read, address: {}}}"
 
 

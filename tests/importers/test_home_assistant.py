@@ -123,8 +123,6 @@ def test_brightness_and_colour_of_a_home_assistant_light_are_marked_as_gaps(tmp_
     ]
 
 
-# ---- layouts ----
-
 SENSORS = "sensors:\n  - {name: volts, slave: 1, address: 1, data_type: float32}\n"
 HUB = f"name: hub\ntype: tcp\nhost: 10.0.0.5\n{SENSORS}"
 
@@ -206,9 +204,6 @@ def test_invalid_home_assistant_document_raises_value_error_with_the_reason(
     (tmp_path / "a.yaml").write_text(text)
     with pytest.raises(ValueError, match=re.escape(reason)):
         read_devices(tmp_path / "a.yaml")
-
-
-# ---- line settings of hubs ----
 
 
 @table(

@@ -262,9 +262,6 @@ def test_esphome_document_becomes_a_loadable_family(tmp_path: Path) -> None:
     assert loaded(tmp_path, device, "level", "part", "running")["part"].part == (4, 11)
 
 
-# ---- refusals ----
-
-
 def bomb(levels: int) -> str:
     """Return YAML in which each list contains the previous list ten times."""
     lists = "".join(
@@ -314,9 +311,6 @@ def test_registers_above_the_limit_of_a_family_are_reported_as_not_imported(
     assert declared[-1] == "r2"
 
 
-# ---- all kinds of files ----
-
-
 @table(
     ("name", "text", "expected"),
     [
@@ -349,8 +343,6 @@ def test_texts_from_an_imported_file_cannot_inject_toml(tmp_path: Path) -> None:
     device.lost.append("a\n[command]\nb = { at = 1 }")
     assert list(tomllib.loads(family_text(device, "x\n[command]\n"))) == ["family", "reading"]
 
-
-# ---- line settings ----
 
 HUBS = """
 modbus:
@@ -435,9 +427,6 @@ def test_read_limits_of_a_device_are_imported(tmp_path: Path) -> None:
         assert f"together = {{ holding = {most}, input = {most} }}" in family_text(device, "x")
         assert set(loaded(tmp_path, device, "a", "b")) == {"a", "b"}
     assert "together =" not in family_text(only(tmp_path, "t.json", template.format(0, channels)), "x")
-
-
-# ---- the command `multidrop import` ----
 
 
 def test_devices_with_the_same_address_on_two_hubs_stay_separate(run: Run, tmp_path: Path) -> None:

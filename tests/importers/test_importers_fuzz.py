@@ -59,9 +59,6 @@ def test_damaged_file_is_imported_or_refused_with_one_error(tmp_path: Path, seed
     read("import", damaged(seed), tmp_path)
 
 
-# ---- generated files with random entries ----
-
-
 LARGE = st.sampled_from(
     [1 << 31, 1 << 32, (1 << 63) - 1, 1 << 63, (1 << 64) - 1, 1 << 64, -(1 << 63), -(1 << 64)]
 )
@@ -167,9 +164,6 @@ def test_imported_device_with_random_keys_gives_a_family_that_loads(
     for header in ("name,address,type,unit,scale,offset,len", "address,fc,gain,decimal,bit,signed,access"):
         table = "\n".join([header, *map(",".join, rows)])
         read("import", f".csv\n{table}".encode(), tmp_path)
-
-
-# ---- limits of time and memory ----
 
 
 def csv(rows: str) -> bytes:

@@ -94,9 +94,6 @@ def test_saved_parameters_are_restored_after_a_factory_reset(tmp_path: Path, fam
     assert line.written[sent:] == []
 
 
-# ---- reasons to write nothing at all ----
-
-
 @pytest.mark.parametrize("family", FAMILIES)
 def test_running_motor_makes_apply_raise_and_write_nothing(family: type[Drive]) -> None:
     line, drive, sim = attached(made(family), EXTRA[family])
@@ -157,9 +154,6 @@ def test_parameters_of_another_model_are_refused() -> None:
         params.apply(drive, other)
 
 
-# ---- parameters that are left out ----
-
-
 def test_communication_parameters_are_written_only_with_the_option_also() -> None:
     _, drive, sim = attached(YD1000(1), [])
     left = params.apply(drive, {"F803": 30, "F801": 0, "F111": 3}, also=["F801"])
@@ -215,9 +209,6 @@ def test_a_value_above_its_upper_limit_is_left_out() -> None:
     _, drive, _ = attached(YD1000(1), [])
     left = params.plan(drive, {"0013": 9000}).left
     assert left == {"0013": "90.00 Hz is outside its limits, which are upper_limit_frequency of yd1000@1"}
-
-
-# ---- the EEPROM ledger and the journal of writes ----
 
 
 def test_second_write_within_a_minute_is_refused_without_commissioning(tmp_path: Path) -> None:
@@ -339,9 +330,6 @@ def test_a_refused_second_write_suggests_the_command_that_permits_it() -> None:
         drive.write("acceleration_time", 30.0)
     way = "wait, set it on the drive's panel, or use `multidrop params apply --commissioning`"
     assert way in refusal.value.for_command_line()
-
-
-# ---- calls of apply that are killed ----
 
 
 CODES = [f"P0{group}.{index:02}" for group in (1, 2) for index in range(4)]

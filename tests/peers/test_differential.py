@@ -43,9 +43,6 @@ PYMODBUS = (PYMODBUS_RTU, PYMODBUS_ASCII)
 ALL = (LIBMODBUS, *PYMODBUS)
 
 
-# ---- conditions of the rules ----
-
-
 def count_of(said: SampleFrame) -> int:
     return int.from_bytes(said.body[4:6])
 
@@ -92,9 +89,6 @@ def confirms_another_write(said: SampleFrame) -> bool:
 def has_other_data(said: SampleFrame) -> bool:
     asked = data_bytes(said.request.function, said.request.count)
     return said.function in READS and said.octet(2) != asked
-
-
-# ---- the rules ----
 
 
 @dataclass(frozen=True)
@@ -227,9 +221,6 @@ REPLIES = [
 ]
 
 
-# ---- check the rules ----
-
-
 @dataclass(frozen=True)
 class Difference:
     said: SampleFrame
@@ -268,8 +259,6 @@ NUMBER = 3000  # frames in each comparison
 RTU, ASCII = Framing.RTU, Framing.ASCII
 framings = pytest.mark.parametrize("framing", [RTU, ASCII], ids=str)
 
-# ---- our decoder ----
-
 
 def received(said: SampleFrame) -> tuple[int, Verdict]:
     used, message = parse_request(said.framing, said.frame)
@@ -292,9 +281,6 @@ def trimmed(message: Message) -> Message:
 
 def trim(verdict: Verdict) -> Verdict:
     return verdict if isinstance(verdict, str) else trimmed(verdict)
-
-
-# ---- libmodbus ----
 
 
 @pytest.fixture(scope="module")
@@ -334,9 +320,6 @@ def test_requests_and_decoded_replies_equal_those_of_a_libmodbus_client(libmodbu
     explain(differences, REPLIES, LIBMODBUS)
     assert values > NUMBER / 3
     assert any(difference.theirs == UNKNOWN_CODE for difference in differences)
-
-
-# ---- pymodbus ----
 
 
 def name(framing: Framing) -> str:

@@ -127,9 +127,6 @@ async def late_values(backend: str, framer: str) -> tuple[int, int, int]:
     return right, wrong, READS - right - wrong
 
 
-# ---- tests ----
-
-
 @pytest.mark.skipif(find_spec("modbus_connection") is not None, reason="modbus-connection is installed")
 def test_error_without_modbus_connection_says_what_to_install() -> None:
     with pytest.raises(ImportError, match=r"needs Python 3\.12 or newer .* modbus-connection: pip install"):

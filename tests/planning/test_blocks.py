@@ -120,9 +120,6 @@ def test_registers_with_different_polling_rates_share_no_request() -> None:
     assert [(each.block.start, each.block.count, each.every) for each in found] == [(1, 4, 0.1), (2, 1, None)]
 
 
-# ---- against all other plans ----
-
-
 def partitions(registers: list[Register[float]]) -> Iterator[list[list[Register[float]]]]:
     if not registers:
         yield []
@@ -305,9 +302,6 @@ def test_no_other_plan_for_a_built_in_family_takes_less_time(data: st.DataObject
         # the documents of these families only describe reads of one register
         if model.startswith(("delixi", "yd1000")):
             assert len(block.registers) == 1
-
-
-# ---- the order of a bus cycle ----
 
 
 def silences(order: list[Drive], switching: float = 0.0) -> float:

@@ -43,9 +43,6 @@ def spans(drive: Drive, *names: str) -> list[tuple[int, int]]:
     return [(block.start, block.count) for block in blocks(drive, wanted)]
 
 
-# ---- no stated limit ----
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("table", "most", "apart"), [(HOLDING, 125, 1), (INPUT, 125, 1), (COIL, 2000, 8), (DISCRETE, 2000, 8)]
@@ -106,9 +103,6 @@ def test_requests_that_read_the_built_in_families_are_unchanged(model: str) -> N
     assert sorted(found) == REQUESTS[model]
 
 
-# ---- a meter of 39 floats ----
-
-
 def test_meter_of_39_floats_needs_eight_requests_or_four_with_readable_gaps() -> None:
     assert len(ADDRESSES) == 39
     lines = []
@@ -126,9 +120,6 @@ def test_requests_to_a_meter_include_only_declared_registers_by_default() -> Non
     asked = [range(one.start, one.start + one.count) for one in blocks(drive, drive.readings())]
     assert all(at in declared or one.start == 0xFC00 for one in asked for at in one)
     assert {at for one in asked for at in one} == declared | {0xFC00, 0xFC01}
-
-
-# ---- tables with the same read function ----
 
 
 class Mixed(Drive):
@@ -169,9 +160,6 @@ def test_register_of_one_word_can_be_written_by_function_10h() -> None:
     together = sim.answer(block.request, 2)
     assert together is not None
     assert together.data == bytes((0, 0, 0, 7, 0, 0))
-
-
-# ---- registers that overlap ----
 
 
 LAYOUTS = st.lists(
@@ -224,9 +212,6 @@ def test_no_other_plan_for_overlapping_registers_takes_less_time(
         if all(allowed(drive, group, limit or 125) for group in way)
     )
     assert seconds(ours) == pytest.approx(best)
-
-
-# ---- groups ----
 
 
 class Grouped(Drive):

@@ -625,9 +625,6 @@ TestOperation = Operation.TestCase
 TestOperation.settings = settings(max_examples=examples(100), stateful_step_count=30, deadline=None)
 
 
-# ---- removed jobs ----
-
-
 def test_next_due_poll_is_found_after_another_poll_was_removed() -> None:
     made: Schedule[Job] = Schedule()
     jobs = {at: job(at, 1000) for at in (13, 14, 1, 15)}
@@ -660,9 +657,6 @@ def test_drive_that_was_forgotten_is_polled_like_a_new_drive() -> None:
     made.back_off.forget(1)
     made.add(again := job(1), 0)
     assert again in [each for each, _ in take(made, 1, 20)]
-
-
-# ---- drives that have never answered ----
 
 
 def meet(*jobs: Job) -> Schedule[Job]:

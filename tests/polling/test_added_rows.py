@@ -300,9 +300,6 @@ def test_a_comment_is_the_status_of_its_row(port: str) -> None:
     assert "a comment" in {row.status for row in rows}
 
 
-# ---- a computer that sleeps during polling ----
-
-
 HOUR_NS = 3600 * 10**9
 PLANT = """
 [[line]]

@@ -91,8 +91,6 @@ def check_rates(made: ClockedLines, wait: float = 1.0, **periods: float) -> list
     return rows
 
 
-# ---- lines that stay as they are ----
-
 OTHERS = (
     (yard(toy("fan-1", 1), toy("fan-3", 3)),),
     (),
@@ -135,9 +133,6 @@ def test_adopting_an_equal_plant_keeps_drive_objects_and_ports() -> None:
         assert sorted(made.opened) == ["port of hall", "port of yard"]
         pump, _ = made.poller.bus("hall").drives
         assert pump is before.lines[0].drives[0].drive
-
-
-# ---- changes on an open port ----
 
 
 @pytest.mark.slow
@@ -206,9 +201,6 @@ def test_adopt_keeps_the_port_of_a_renamed_line_open() -> None:
         assert list(made.poller.statistics()) == ["yard", "hall"]
         assert [drive.name for drive in made.poller.bus("hall").drives] == ["fan-1", "fan-2"]
         assert sorted(made.opened) == ["port of hall", "port of yard"]
-
-
-# ---- lines that come and go ----
 
 
 @pytest.mark.long
@@ -337,9 +329,6 @@ def test_a_replacing_drive_expects_late_replies_to_the_replaced_drive() -> None:
         assert new.late_until_ns == before.late_until_ns > 0
 
 
-# ---- ports that are absent ----
-
-
 @pytest.mark.slow
 def test_adopt_reports_an_absent_port_and_opens_it_when_it_exists() -> None:
     with clocked(hall(*pumps())) as made:
@@ -367,9 +356,6 @@ def test_add_line_raises_if_the_port_is_absent() -> None:
         assert list(made.poller.buses) == ["hall"]
         rows = check_rates(made, 0, pump_1=0.1)
         assert statuses(rows, "fan-1") == set()
-
-
-# ---- plants that cannot be adopted ----
 
 
 def broken() -> dict[str, tuple[Plant, str]]:
@@ -479,9 +465,6 @@ def test_adopt_rejects_other_types() -> None:
     poller.close()
 
 
-# ---- batches ----
-
-
 def test_polled_since_separates_the_rows_of_two_drives_with_one_name() -> None:
     """Three drives on two lines swap their names. Each drive has a different value."""
     wires = {"port of hall": toys(), "port of yard": wire(*(Toy(address) for address in (5, 6)))}
@@ -550,9 +533,6 @@ def test_a_drive_name_has_the_same_code_in_all_batches() -> None:
                 for code in set(columns.drive):
                     assert meant.setdefault(code, columns.drives[code]) == columns.drives[code]
         assert {"pump-1", "fan-1", "vent-1", "pump-2"} <= set(meant.values())
-
-
-# ---- many adoptions ----
 
 
 @pytest.mark.long

@@ -135,9 +135,6 @@ class Blocked:
         return self._threads[-1]
 
 
-# ---- motors ----
-
-
 def test_motors_keep_running_when_their_line_is_removed(both: TwoLines) -> None:
     with Poller(plant(both.hall(), both.yard())) as poller:
         poller.bus("yard").drives[0].start()
@@ -229,9 +226,6 @@ def _note_writes(sim: SimulatedDrive, writes: list[int]) -> None:
         write(function, start, values)
 
     vars(sim)["write"] = noted
-
-
-# ---- pending calls ----
 
 
 def blocked_stop(
@@ -435,9 +429,6 @@ def test_closing_a_poller_waits_for_adopt_on_another_thread(
     assert not any(bus.is_open for bus in poller.buses.values())
 
 
-# ---- the network ----
-
-
 def test_adopt_connects_to_several_servers_in_parallel(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two calls of `create_connection` wait for each other, so connecting one after the other would fail.
     Closing the connections never sleeps.
@@ -502,9 +493,6 @@ def until_sampled(poller: Poller, drive: str) -> None:
     until(lambda: samples(poller, drive) > 5)
 
 
-# ---- readers during an adoption ----
-
-
 class Dawdling(dict[object, object]):
     """A dict in which another thread makes a change while a caller iterates over the values."""
 
@@ -533,9 +521,6 @@ def test_a_summary_during_adopt_shows_either_the_old_or_the_new_plant(both: TwoL
         assert set(poller.summary()["lines"]["hall"]["drives"]) == {"pump-1", "pump-2"}
         dawdling.wait()
         assert [drive.name for drive in poller.bus("hall").drives] == ["pump-1"]
-
-
-# ---- many adoptions ----
 
 
 @pytest.mark.long

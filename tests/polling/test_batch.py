@@ -148,9 +148,6 @@ def test_every_status_code_has_its_text() -> None:
     assert all(statuses)
 
 
-# ---- columns as memoryviews ----
-
-
 def test_columns_hold_all_rows_and_the_names_for_their_codes() -> None:
     columns = example().columns()
     drives, registers, statuses = columns.drives, columns.registers, columns.statuses
@@ -197,9 +194,6 @@ def test_names_added_later_do_not_change_the_codes_of_earlier_names() -> None:
     first = Batch(Columns(1), names, names).columns()
     assert names.number("b") == 1
     assert (first.drives, Batch(Columns(1), names, names).columns().drives) == (("a",), ("a", "b"))
-
-
-# ---- iteration; drives by name; plants ----
 
 
 @pytest.fixture
@@ -289,9 +283,6 @@ def test_the_time_of_a_row_is_a_datetime() -> None:
     row = Row(1_700_000_000_123_456_789, 1, None, "pump", "speed", None, "no reply")
     assert row.time == datetime(2023, 11, 14, 22, 13, 20, 123456, tzinfo=UTC)
     assert row.time_ns == 1_700_000_000_123_456_789
-
-
-# ---- real polled rows, taken by Arrow libraries ----
 
 
 def polled_batches() -> list[Batch]:
@@ -404,9 +395,6 @@ def test_no_library_is_imported_before_it_is_needed() -> None:
     # Most programs use neither family files nor captures.
     late |= {"importlib.metadata", "multidrop.families.files.loader"}
     assert late.isdisjoint(told.stdout.split())
-
-
-# ---- the wide form ----
 
 
 def test_registers_of_one_request_share_a_row_of_the_wide_form() -> None:

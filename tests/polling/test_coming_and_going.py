@@ -215,9 +215,6 @@ def test_statistics_can_be_read_while_drives_leave(port: str, monkeypatch: pytes
         assert list(bus.statistics().drives) == ["pump-1"]
 
 
-# ---- drives attached with the bus ----
-
-
 PLANT = """
 [[line]]
 name = "a"

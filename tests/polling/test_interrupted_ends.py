@@ -219,8 +219,6 @@ def test_a_simulator_can_be_ended_after_an_interrupted_start_or_end(step: int, d
     assert every(step, act) > 1
 
 
-# ---- memory that the core may still write to ----
-
 LEFT_OPEN = """
 import gc, sys, time
 sys.path[:0] = {path!r}
@@ -264,9 +262,6 @@ def test_a_poller_left_open_at_exit_does_not_corrupt_memory(hall: Received, end:
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, env=env)
     assert (ran.returncode, ran.stderr) == (0, "")
     falls_silent(lambda: hall.drive.requests)
-
-
-# ---- openings ----
 
 
 @pytest.mark.parametrize("interrupted", [0, 1, 2])

@@ -161,9 +161,6 @@ def test_the_summary_of_a_plant_without_mastership_counts_no_foreign_bytes() -> 
         assert "foreign_bytes" not in poller.summary()["lines"]["hall"]
 
 
-# ---- another master ----
-
-
 @contextmanager
 def seen_line(mastership: Mastership, every: float | None) -> Iterator[tuple[int, Poller]]:
     """Yield the far end of a polled line on which no drive answers, and the line's poller."""
@@ -243,9 +240,6 @@ def test_another_master_is_reported_and_polling_starts_when_it_falls_silent(
         silent = time.monotonic()
         wait_for_bytes(far)
         assert time.monotonic() - silent >= LONGEST
-
-
-# ---- lines that come and go ----
 
 
 class Listener:

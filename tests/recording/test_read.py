@@ -130,9 +130,6 @@ def test_repr_of_a_recording_shows_its_rows_drives_and_time_span(tmp_path: Path)
     assert re.match(about, repr(multidrop.open_recording(path)))
 
 
-# ---- a machine without nanoarrow can still record ----
-
-
 WITHOUT = "import sys; sys.modules['nanoarrow'] = None; from multidrop.cli import main; sys.exit(main())"
 
 

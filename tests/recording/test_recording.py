@@ -121,9 +121,6 @@ def test_a_reader_ends_where_the_recording_ended_when_it_was_opened(tmp_path: Pa
         assert rows(reader) == list(counting(10))
 
 
-# ---- opened by other programs ----
-
-
 def test_pyarrow_opens_an_arrows_file(tmp_path: Path) -> None:
     with pa.ipc.open_stream(record(tmp_path / "a.arrows").read_bytes()) as stream:
         table = stream.read_all()
@@ -244,8 +241,6 @@ def test_csv_without_metadata_is_read(tmp_path: Path) -> None:
     assert (reader.metadata, rows(reader)) == ({}, RECORDED)
 
 
-# ---- any rows at all ----
-
 INT64 = st.integers(-(2**63), 2**63 - 1)
 ANY = st.text(st.characters(exclude_categories=["Cs"]), max_size=8)
 NAME = ANY | st.text("'=+-@\t\r\nx", max_size=4)  # text that a spreadsheet may evaluate
@@ -312,9 +307,6 @@ def test_no_text_in_a_csv_is_a_formula_and_all_texts_are_read_back(tmp_path: Pat
     assert not [cell for cell in cells if cell.startswith(("=", "+", "-", "@", "\t", "\r"))]
     assert cells[6:] == ["''=1", "'" + "''-", "'old'", "a=b", ""]
     assert rows(open_recording(tmp_path / "a.csv")) == some
-
-
-# ---- converting ----
 
 
 @every_format
@@ -400,9 +392,6 @@ def test_a_conversion_interrupted_by_ctrl_c_leaves_no_file(
     assert set(tmp_path.iterdir()) == before
 
 
-# ---- mistakes of callers ----
-
-
 @table("act", [lambda path: open_writer(path, {}), open_recording, repair])
 @table("name", ["a.xlsx", "a", "arrows", "a.arrow"])
 def test_a_recording_with_an_unknown_suffix_is_refused(tmp_path: Path, act: object, name: str) -> None:
@@ -449,9 +438,6 @@ def test_arrows_and_csv_files_are_written_and_read_without_pyarrow(
     for name in ("pyarrow", "numpy", "pandas", "polars"):
         monkeypatch.setitem(sys.modules, name, None)
     assert rows(open_recording(record(tmp_path / f"a{suffix}"))) == RECORDED
-
-
-# ---- dictionaries ----
 
 
 def test_recordings_of_earlier_versions_are_read(tmp_path: Path) -> None:

@@ -57,9 +57,6 @@ def record(path: Path, batches: int) -> list[int]:
     return lengths
 
 
-# ---- truncated ends ----
-
-
 @pytest.mark.long
 def test_an_arrows_file_cut_at_any_byte_loses_only_the_incomplete_batch(tmp_path: Path) -> None:
     path = tmp_path / "a.arrows"
@@ -198,8 +195,6 @@ def test_the_end_marker_of_an_arrow_stream_is_not_a_truncated_end(tmp_path: Path
     assert (reader.truncated, reader.metadata, [*chain.from_iterable(reader)]) == (0, {}, list(example()))
 
 
-# ---- killed ----
-
 RECORD_FOR_EVER = """
 import sys
 sys.path[:0] = sys.argv[2:]
@@ -247,8 +242,6 @@ def test_the_error_for_a_parquet_file_that_was_not_closed_says_so(tmp_path: Path
         with pytest.raises(ValueError, match=r"not a recording: .* readable only once it is closed"):
             open_recording(path)
 
-
-# ---- disks ----
 
 FILL_THE_DISK = """
 import resource, sys
@@ -406,9 +399,6 @@ def test_a_csv_with_a_header_has_its_metadata(tmp_path: Path, room: int) -> None
     assert not list(tmp_path.glob("*.tmp"))
 
 
-# ---- clocks ----
-
-
 @table("suffix", FORMATS)
 def test_rows_keep_their_order_if_the_clock_is_set_back(tmp_path: Path, suffix: str) -> None:
     """Rows stay in the order of `monotonic_ns`, although `time` jumps back with the clock."""
@@ -423,8 +413,6 @@ def test_rows_keep_their_order_if_the_clock_is_set_back(tmp_path: Path, suffix: 
     assert [row.monotonic_ns for row in found] == [1, 2]
     assert [row.time_ns for row in found] == [UTC_0 + 1, UTC_0 + 2 - 3600 * SECOND]
 
-
-# ---- files that are not recordings ----
 
 GARBAGE = {
     "empty": b"",

@@ -165,9 +165,6 @@ def test_a_failed_segment_leaves_no_file_and_its_number_is_skipped(tmp_path: Pat
         assert names(tmp_path) == ["run.00000002.arrows"]
 
 
-# ---- retention ----
-
-
 def test_old_segments_are_removed_when_a_segment_starts(tmp_path: Path, hand: Hand) -> None:
     with SegmentWriter(tmp_path / "run.arrows", ABOUT, every=DAY, keep=3 * DAY) as writer:
         for number in range(8):

@@ -65,9 +65,6 @@ class Bench:
         self.motor.run_to(self.now)
 
 
-# ---- ERMAN ER-G-220-01(02) ----
-
-
 @pytest.fixture
 def erman() -> Bench:
     return Bench(ErmanERG220(1))
@@ -181,9 +178,6 @@ def test_simulated_erman_emergency_stop_prevents_a_start_until_a_reset(erman: Be
     assert erman.motor.energised
 
 
-# ---- INVT CHE ----
-
-
 class MyCHE(InvtCHE):
     jump = parameter(8)
     acceleration_time = parameter(11, "s", step=0.1, default=10)
@@ -293,9 +287,6 @@ def test_simulated_che_replies_to_a_damaged_frame_with_exception_11h(che: Bench)
     assert che.send(bytes.fromhex("01 03 10 01 00 01 D1 0B")) == checksums.rtu("01 83 11")
     assert che.send(bytes.fromhex("02 03 10 01 00 01 D1 0B")) == b""
     assert che.sim.counters.damaged == 1
-
-
-# ---- INNOVERT IBD ----
 
 
 @pytest.fixture
@@ -415,9 +406,6 @@ def test_delixis_forward_command_resets_a_fault_of_a_simulated_innovert_ibd(ibd:
     assert (ibd.motor.fault, ibd.motor.energised) == (0, False)
 
 
-# ---- Delixi, standard Modbus ----
-
-
 @pytest.fixture
 def delixi() -> Bench:
     return Bench(DelixiModbus(1))
@@ -470,9 +458,6 @@ def test_simulated_delixi_obeys_only_run_commands_among_broadcasts(delixi: Bench
     assert delixi.sim["frequency"] == 0
     delixi.sim.answer(Message(0, 6, 0x2000, data=b"\x00\x12"), 0.0)
     assert delixi.motor.energised
-
-
-# ---- Delixi's own protocol ----
 
 
 @pytest.fixture
@@ -585,9 +570,6 @@ def test_simulated_delixi_native_carries_out_a_broadcast_without_a_reply(native:
 def test_simulated_delixi_drives_ignore_frames_of_the_other_protocol(native: Bench) -> None:
     assert native.exchange(":010301F4000106") == ""
     assert Bench(DelixiModbus(1, framing=Framing.ASCII)).exchange(":010701F400000000FD") == ""
-
-
-# ---- YD1000 ----
 
 
 @pytest.fixture
@@ -792,9 +774,6 @@ def test_simulated_yd1000_watchdog_trips_if_the_line_is_silent_too_long(yd: Benc
     yd.now += 6
     assert yd.read(3, 0x1100) == [0]
     assert yd.motor.fault
-
-
-# ---- all families ----
 
 
 CONFIRMED = {  # Frames to which the reply is a copy. Those of InvtCHE and YD1000 are built from the tables.

@@ -137,9 +137,6 @@ def test_fault_start_noise_occurs_only_when_a_motor_starts() -> None:
     assert line.wire.struck["start_noise"] == 1
 
 
-# ---- faults of one drive ----
-
-
 def two_drives(**faults: Any) -> LineClient:
     """Return the client of a line with two drives, of which the second has these faults."""
     drives = [SimulatedDrive(Toy(1, name="sound")), SimulatedDrive(Toy(2, name="flaky"))]
@@ -202,9 +199,6 @@ def test_fault_trip_is_refused_for_a_drive_without_a_motor() -> None:
         two_drives(trip=1.0)
 
 
-# ---- a port that hangs up ----
-
-
 @pytest.mark.parametrize("port", ["link", "socket://127.0.0.1:0"])
 def test_simulated_port_that_was_removed_returns_at_its_path(port: str, tmp_path: Path) -> None:
     where = str(tmp_path / port) if port == "link" else port
@@ -257,9 +251,6 @@ def read(line: Line) -> bytes:
 def test_fault_hang_up_is_refused_for_a_pty_without_a_link() -> None:
     with pytest.raises(ValueError, match=r"^line: a port that hangs up must be a link or a TCP port"):
         FaultyWire([simulated(Toy(1))], Faults(hang_up=0.1))
-
-
-# ---- the faults file ----
 
 
 def test_every_key_of_a_faults_file_is_loaded(tmp_path: Path) -> None:

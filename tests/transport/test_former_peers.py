@@ -138,9 +138,6 @@ def test_a_drive_is_remembered_exactly_as_long_as_late_replies_are_expected(
     assert not names & peers._former.keys()
 
 
-# ---- an earlier process ----
-
-
 BEGIN = 1000.0  # s; start of the simulated clock
 
 DELAY = 0.1  # s; delay of the network between line and drive

@@ -43,9 +43,6 @@ def read_and_write(bus: Bus) -> None:
     assert toy.write(toy.frequency, 25.0) == 25.0
 
 
-# ---- the kinds of ports ----
-
-
 def test_a_drive_is_read_and_written_through_a_socket_port() -> None:
     with Simulator([wire("socket://127.0.0.1:0")]) as sim, Bus(sim.wires[0].path) as bus:
         read_and_write(bus)
@@ -200,9 +197,6 @@ def test_drives_with_different_settings_on_an_rfc2217_port_raise(server: SerialS
         Poller(plant(line(server.url, polled(slow, [Toy.status]), polled(fast, [Toy.status]))))
 
 
-# ---- ports that cannot be opened ----
-
-
 def os_words_of_an_unknown_zone() -> str:
     with pytest.raises(socket.gaierror) as failure:
         socket.getaddrinfo("fe80::1%nowhere", 4001)
@@ -269,9 +263,6 @@ def test_ports_that_were_closed_or_failed_to_open_leave_no_descriptor_or_thread(
             with pytest.raises(LineError):
                 Line("/dev/null").open()
         assert (descriptors(), threads()) == before
-
-
-# ---- ports that fail later ----
 
 
 def vanishing_socket() -> tuple[str, Callable[[], None]]:

@@ -48,9 +48,6 @@ IAC, SB, SE = rfc2217.IAC, rfc2217.SB, rfc2217.SE
 pyserials_own = pytest.mark.filterwarnings("ignore:set(Daemon|Name)\\(\\) is deprecated:DeprecationWarning")
 
 
-# ---- telnet ----
-
-
 def pieces(stream: bytes, cuts: list[int]) -> list[bytes]:
     edges = [0, *sorted(at % (len(stream) + 1) for at in cuts), len(stream)]
     return [stream[begin:end] for begin, end in pairwise(edges)]
@@ -105,9 +102,6 @@ def test_an_endless_telnet_suboption_does_not_fill_the_memory() -> None:
         tracemalloc.stop()
 
 
-# ---- a flood ----
-
-
 @contextmanager
 def flooding() -> Iterator[tuple[str, threading.Event]]:
     """Yield the URL of a port that sends endlessly, and an event that is set after 32 MB."""
@@ -153,9 +147,6 @@ def test_an_unread_flood_does_not_fill_the_memory() -> None:
         held = sum(len(chunk) for chunk in list(port._read_buffer.queue))
         port.close()
     assert 0 < held <= MOST_CHUNKS * MOST_RECEIVED
-
-
-# ---- requests that are too late ----
 
 
 class HeldUp:
@@ -286,9 +277,6 @@ def test_a_write_fails_immediately_if_the_socket_buffer_is_full() -> None:
     port.is_open = False
     near.close()
     far.close()
-
-
-# ---- a network that is cut ----
 
 
 _DONE, _TIME_WAIT = "05", "06"  # states in which all our data has arrived (net/tcp_states.h: TCP_FIN_WAIT2)

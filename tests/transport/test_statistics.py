@@ -29,8 +29,6 @@ __all__ = ["drive", "line"]  # fixtures
 
 LEAST_NS, MOST_NS = 1 << 17, 1 << 32  # delays whose quantiles have an error of at most 1/16
 
-# ---- response delays ----
-
 
 def counters_of(delays_ns: list[int]) -> Counters:
     known = Peer(least_timeout=0.02, most_timeout=1)
@@ -104,9 +102,6 @@ def test_the_utilisation_of_a_port_faster_than_its_settings_is_at_most_1(
     found = Statistics((line.now - begun) / 1e9, drive.counters())
     assert found.samples == 100
     assert 0.9 < found.utilisation <= 1.0 + 1e-9
-
-
-# ---- the guide's counters ----
 
 
 def exchange(request: Message, known: Peer, framing: Framing) -> Exchange:
@@ -187,9 +182,6 @@ def test_overruns_are_read_from_the_port_s_driver(monkeypatch: pytest.MonkeyPatc
             assert bus.line.overruns() == 120
 
 
-# ---- spans ----
-
-
 def line_of(seconds: float, overruns: int | None = None, **drives: Counters) -> LineStatistics:
     return line_statistics(seconds, drives, overruns)
 
@@ -217,9 +209,6 @@ def test_since_derives_the_longest_delay_from_the_buckets() -> None:
     assert 8e-3 <= found.longest <= 8e-3 * 9 / 8  # the end of the bucket that has 8 ms
     record = counters_of([50 * MS, 8 * MS, 70 * MS])
     assert line_of(2, pump=record).since(line_of(1, pump=early)).delays.longest == 0.070
-
-
-# ---- statistics of a bus and of a poller ----
 
 
 @pytest.fixture
@@ -289,9 +278,6 @@ def test_reset_statistics_resets_renamed_and_replaced_drives_too(toy: SimulatedD
         assert {name: drive.exchanges for name, drive in found.drives.items()} == {"c": 1, "a": 1, "b": 1}
         assert found.exchanges == 3
     assert bus.statistics().exchanges == 3  # the bus is closed, and the counts stay
-
-
-# ---- a polled line ----
 
 
 STEPS = 400

@@ -73,9 +73,6 @@ def responder(answer: bytes) -> Iterator[tuple[str, list[bytes]]]:
         yield place, came
 
 
-# ---- names ----
-
-
 @pytest.mark.parametrize(
     ("name", "opened", "identity"),
     [
@@ -98,9 +95,6 @@ def test_an_invalid_tcp_url_raises_a_one_sentence_error(name: str) -> None:
 def test_a_port_without_a_listener_is_reported() -> None:
     with pytest.raises(LineError, match="nothing listens there"):
         Bus("tcp://127.0.0.1:1")
-
-
-# ---- drives ----
 
 
 @pytest.fixture
@@ -203,9 +197,6 @@ def test_every_mistake_of_a_plant_file_is_reported(tmp_path: Path) -> None:
     assert "framing tcp is for tcp:// ports" in said
 
 
-# ---- several lines of one gateway ----
-
-
 def plant_of_two(path: Path, port: str, second: int) -> Path:
     path.write_text(
         "".join(
@@ -254,8 +245,6 @@ def test_one_unit_id_on_two_lines_to_one_gateway_is_a_mistake(tmp_path: Path) ->
     with pytest.raises(PlantError, match=sentence):
         load_plant(plant_of_two(tmp_path / "plant.toml", "tcp://10.0.0.7", 1))
 
-
-# ---- far ends with another protocol ----
 
 READ = Message(1, 3, 3, 1)
 
@@ -314,9 +303,6 @@ def test_mixed_up_recognises_only_frames_of_the_other_protocol(kind: str) -> Non
     assert mixed_up(port, other)
     assert not any(mixed_up(port, came) for came in (own, b"", b"\0" * 4, b"HTTP/1.1 400 Bad Request"))
     assert not any(mixed_up("/dev/ttyUSB0", came) for came in (rtu, tcp))
-
-
-# ---- peers that close ----
 
 
 class TwoBlocks(Drive):

@@ -196,9 +196,6 @@ def plant(tmp_path: Path) -> Path:
     return path
 
 
-# ---- Ctrl-C ----
-
-
 def test_ctrl_c_ends_a_poll_with_a_complete_recording(wine: Wine, pump: MotorDrive, plant: Path) -> None:
     out = plant.with_name("запись.arrows")
     with wine.console("-m", "multidrop", "poll", plant, "--out", out) as console:
@@ -305,9 +302,6 @@ def test_ctrl_c_during_a_start_reports_sent_frames_and_the_stop_command(
     assert [write.data for write in received.writes[begun:]] == [b"\0\5"]
 
 
-# ---- names, paths, consoles ----
-
-
 @pytest.mark.parametrize("name", ["COM5", "com5", r"\\.\COM5", "COM10", "com10", r"\\.\COM10"])
 def test_a_port_can_be_opened_by_each_of_its_names(wine: Wine, pump: MotorDrive, name: str) -> None:
     wine.link("com10", wine.terminal_of("com5"))
@@ -338,9 +332,6 @@ def test_console_prints_all_letters(wine: Wine, plant: Path) -> None:
         console.until_said("насос")
 
 
-# ---- settings, RTS ----
-
-
 @pytest.mark.parametrize("form", ["8E1", "8O1", "8N2"])
 def test_a_port_is_set_to_parity_and_stop_bits(wine: Wine, pump: MotorDrive, form: str) -> None:
     """Check only that the port accepts both settings, because a pseudo-terminal does not use them."""
@@ -366,9 +357,6 @@ def test_terminal_without_rts_is_not_opened(wine: Wine, pump: MotorDrive, mode: 
     assert sentence.startswith("multidrop.errors.LineError: COM5: the driver " + reason)
 
 
-# ---- a process that is killed ----
-
-
 def test_recording_of_a_killed_poll_is_readable(wine: Wine, pump: MotorDrive, plant: Path) -> None:
     """Check that the recording is complete, and that the port is free again."""
     out = plant.with_name("killed.arrows")
@@ -383,9 +371,6 @@ def test_recording_of_a_killed_poll_is_readable(wine: Wine, pump: MotorDrive, pl
     ran = wine.run("-m", "multidrop", "poll", plant, "--out", later, "--seconds", 2)
     assert ran.returncode == 0, ran.stderr
     assert "ok" in statuses(later)
-
-
-# ---- ports that vanish ----
 
 
 def test_a_port_that_vanished_is_polled_again_when_it_comes_back(wine: Wine, plant: Path) -> None:

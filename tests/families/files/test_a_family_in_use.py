@@ -147,9 +147,6 @@ def test_plant_with_two_family_files_is_scanned_recorded_and_reported(
     assert run("report", "run.arrows")[0] == 0
 
 
-# ---- confirmation of the family by its owner ----
-
-
 @pytest.mark.parametrize(("name", "value"), [("light", "1"), ("ramp", "1"), ("run", "off")])
 def test_unconfirmed_family_file_with_commands_writes_only_harmless_raw_counts(
     pump: type[Drive], name: str, value: str

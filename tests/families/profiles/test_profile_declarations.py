@@ -137,8 +137,6 @@ def test_setpoint_in_percent_requires_the_option_maximum_frequency() -> None:
         Fc51(1, maximum_frequency=50).set_frequency.script(51).send(None)
 
 
-# ---- identify ----
-
 WELL = {
     "abb-acs355": {"status": 0x0231, "station": 1.0, "signature": 2},
     "danfoss-fc51": {"status": 0x0607, "station": 1.0, "signature": 2},
@@ -206,9 +204,6 @@ def test_identify_refuses_a_drive_with_values_of_another_family(
 def test_drive_that_refuses_to_read_a_profile_register_is_not_identified() -> None:
     with pytest.raises(DriveException):
         identify("abb-acs355", signature=DriveException("abb", 2, "illegal address"))
-
-
-# ---- subclasses of a family ----
 
 
 def test_class_with_a_profile_can_be_extended_by_a_subclass() -> None:

@@ -439,9 +439,6 @@ def test_family_files_of_the_package_are_loaded_on_demand() -> None:
     assert done.stdout.split() == [str(len(SHIPPED)), "{}", "False"]
 
 
-# ---- profiles in users' files ----
-
-
 def load(tmp_path: Path, text: str) -> type[Drive]:
     file = tmp_path / "own.toml"
     file.write_text(text)
@@ -490,9 +487,6 @@ def test_unknown_profile_in_a_family_file_is_reported(tmp_path: Path) -> None:
 def test_adjacent_registers_are_read_in_one_request_if_the_manual_allows_it() -> None:
     assert shipped_family("delta-vfd-el").most_registers
     assert {register.access for register in shipped_family("abb-acs355").readings()} == {Access.READING}
-
-
-# ---- families of other installed packages ----
 
 
 def installed(monkeypatch: pytest.MonkeyPatch, **values: str) -> None:
@@ -554,8 +548,6 @@ def test_unusable_family_package_raises_a_one_sentence_error(
     with pytest.raises(ValueError, match=sentence):
         find_model("acme")
 
-
-# ---- evidence from users' logs ----
 
 # A row of the log gateway/vfd_log.csv in pjbardolia/energy-management, with the values on the drive's keypad.
 CHF100A_LOG = {

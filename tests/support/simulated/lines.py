@@ -60,9 +60,6 @@ class Faulty(Wire):
         return self.fate(reply)
 
 
-# ---- in another process ----
-
-
 class LateWire(Wire):
     """A wire whose `distort` may delay replies with `hold_up`."""
 
@@ -118,9 +115,6 @@ def _serve(make: Callable[[], Sequence[Wire]], connection: Connection) -> None:
     serve(make(), announce)
 
 
-# ---- plants without a file ----
-
-
 def polled(drive: Drive, registers: Iterable[Register[Any]], every: float | None = None) -> PolledDrive:
     return PolledDrive(drive, tuple(Polled(register, every) for register in registers))
 
@@ -139,9 +133,6 @@ def rows_of(poller: Poller) -> list[Row]:
     while batch := poller.take():
         found += batch
     return found
-
-
-# ---- values that identify their register ----
 
 
 def proofs(*drives: PolledDrive) -> dict[tuple[str, str], float]:

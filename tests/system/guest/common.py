@@ -99,9 +99,6 @@ def kernel_settings(path: str) -> tuple[int, str]:
     return struct.unpack_from("2I", raw, 36)[1], f"{5 + (control >> 4 & 3)}{parity}{stop}"
 
 
-# ---- commands ----
-
-
 class Command:
     """A command of multidrop in a forked process, because an interpreter takes seconds to start in the guest.
     The process has the user id and group id `user`, and the additional groups `groups`.
@@ -148,8 +145,6 @@ class Command:
 def run(*words: str, **options: Any) -> tuple[int, str]:
     return Command(*words, **options).outcome()
 
-
-# ---- plants and polls ----
 
 MODEL = "erman-er-g-220"
 FAMILY = "ErmanERG220"
