@@ -89,12 +89,6 @@ def test_a_plain_write_may_stop_the_motor() -> None:
         (YD1000(1), "maximum_frequency", 79, r"below upper_limit_frequency, which is 80 Hz"),
         (ErmanERG220(1), "frequency", 50.1, r"above maximum_frequency, which is 50 Hz"),
         (ErmanERG220(1), "minimum_frequency", 50.1, r"above maximum_frequency"),
-        (
-            InnovertIBD(1, maximum_frequency=60),
-            "frequency",
-            60.01,
-            r"above maximum_frequency, which is 60 Hz",
-        ),
     ],
 )
 def test_a_write_that_its_register_does_not_allow_is_not_sent(

@@ -266,14 +266,6 @@ def test_yd1000_control_words_without_bit_14_are_encoded_as_printed(
     assert frame(YD1000(1), YD1000.control, word) == printed
 
 
-def test_yd1000_start_sends_the_run_word() -> None:
-    wire = Wire(YD1000(1), AT_30_HZ, turns=TURNS)
-    wire.drive.start()
-    wire.drive.start(Direction.FORWARD)
-    wire.drive.start(Direction.REVERSE)
-    assert wire.sent == [FORWARD, FORWARD, REVERSE]
-
-
 def test_yd1000_start_without_a_direction_keeps_a_running_motors_direction() -> None:
     wire = Wire(YD1000(1), {**AT_30_HZ, **TURNS[REVERSE]})
     wire.drive.start()
@@ -292,6 +284,7 @@ def yd_word(word: int) -> str:
         ({"second_ramp": 1}, 0xC440, 0xC640),
         ({"second_ramp": 1, "setpoint_by_fnod": 1}, 0x8440, 0x8640),
         ({"second_ramp": 0, "setpoint_by_fnod": 0}, 0xC400, 0xC600),
+        ({}, 0xC400, 0xC600),
     ],
 )
 def test_yd1000_start_options_select_the_control_bits(
@@ -300,9 +293,10 @@ def test_yd1000_start_options_select_the_control_bits(
     words = [yd_word(forward), yd_word(reverse)]
     turns = dict(zip(words, (TURNS[FORWARD], TURNS[REVERSE]), strict=True))
     wire = Wire(YD1000(1, **options), AT_30_HZ, turns=turns)
+    wire.drive.start()
     wire.drive.start(Direction.FORWARD)
     wire.drive.start(Direction.REVERSE)
-    assert wire.sent == words
+    assert wire.sent == [words[0], *words]
 
 
 def test_yd1000_start_without_a_setpoint_is_refused() -> None:
@@ -478,13 +472,19 @@ FUNCTIONS = {f"input_{at}_function": factory for at, factory in enumerate((2.0, 
         ({"always_on_function": 3.0}, "F110"),
     ],
 )
-def test_yd1000_reset_is_refused_while_a_terminal_commands_a_run(
-    says: dict[str, object], terminal: str
+@table(
+    ("verb", "consequence"),
+    [
+        ("reset_fault", ", and may start the motor"),  # a restart may clear bit 15, as power-on does (8.1)
+        ("release_control", ", .* once the line no longer commands it"),
+    ],
+)
+def test_yd1000_keeps_control_while_a_terminal_commands_a_run(
+    says: dict[str, object], terminal: str, verb: str, consequence: str
 ) -> None:
-    """A restart may clear bit 15, as power-on does (section 8.1). Then the terminals command the motor."""
     wire = Wire(YD1000(1), {**STANDING, **FUNCTIONS, **says})
-    with pytest.raises(WriteForbidden, match=f"^{terminal}.* is set to run, and may start the motor"):
-        wire.drive.reset_fault()
+    with pytest.raises(WriteForbidden, match=f"^{terminal}.* is set to run{consequence}"):
+        getattr(wire.drive, verb)()
     assert wire.sent == []
 
 
@@ -518,25 +518,6 @@ def test_yd1000_release_control_is_refused_unless_the_motor_is_at_rest() -> None
         with pytest.raises(WriteForbidden, match=r"turns: call stop\(\) first"):
             wire.drive.release_control()
         assert wire.sent == []
-
-
-@table(
-    ("says", "terminal"),
-    [
-        ({"inputs": Inputs.F}, "terminal F"),
-        ({"inputs": Inputs.R}, "terminal R"),
-        ({"always_on_function": 3.0}, "F110"),
-    ],
-)
-def test_yd1000_release_control_is_refused_while_a_terminal_commands_a_run(
-    says: dict[str, object], terminal: str
-) -> None:
-    wire = Wire(YD1000(1), {**STANDING, **FUNCTIONS, **says})
-    with pytest.raises(
-        WriteForbidden, match=f"^{terminal}.* is set to run, .* once the line no longer commands it"
-    ):
-        wire.drive.release_control()
-    assert wire.sent == []
 
 
 def test_yd1000_motor_that_turns_after_release_control_is_stopped_again() -> None:
