@@ -373,11 +373,9 @@ def test_a_broadcast_is_followed_by_the_turnaround_delay(monkeypatch: pytest.Mon
     stop, look = made[-2:]
     assert (stop.request.address, look.request.address) == (0, 1)
     driver = LineDriver()
-    driver.begin(stop)
-    driver.wait_until_write()
+    driver.send(stop)
     over = driver.now + 8 * stop.c.character_ns
-    driver.begin(look)
-    driver.wait_until_write()
+    driver.send(look)
     assert driver.now == over + 100 * MS
 
 

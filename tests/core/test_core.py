@@ -189,6 +189,18 @@ def drive() -> Iterator[Callable[[Callable[[Message], bytes]], int]]:
 Drive = Callable[[Callable[[Message], bytes]], int]
 
 
+@pytest.fixture
+def port(drive: Drive) -> Iterator[Port]:
+    """Yield a port whose drive's registers hold their own addresses."""
+    with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
+        yield port
+
+
+@pytest.fixture
+def rows(port: Port) -> Rows:
+    return Rows(port)
+
+
 def test_queued_exchanges_are_carried_out_in_order(drive: Drive) -> None:
     with closing(Port(drive(echo_start), NO_SETTINGS, room=128)) as port:
         rows = Rows(port)
@@ -210,13 +222,11 @@ def test_a_full_queue_accepts_no_further_exchanges(drive: Drive) -> None:
         assert pending(port) == 4
 
 
-def test_no_queued_request_is_sent_before_its_time(drive: Drive) -> None:
-    with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
-        due = [now_ns() + 20_000_000, now_ns() + 40_000_000]
-        rows = Rows(port)
-        queued = [read(0), read(1)]
-        port.submit(queued, due)
-        sent = rows.of("sent", 2)
+def test_no_queued_request_is_sent_before_its_time(port: Port, rows: Rows) -> None:
+    due = [now_ns() + 20_000_000, now_ns() + 40_000_000]
+    queued = [read(0), read(1)]
+    port.submit(queued, due)
+    sent = rows.of("sent", 2)
     assert all(at >= wanted for at, wanted in zip(sent, due, strict=True))
 
 
@@ -234,47 +244,40 @@ def test_all_missed_time_slots_of_an_exchange_are_skipped_except_the_last(drive:
     assert fast.peer.counters().missed == {Status.EXPIRED: 2}
 
 
-def test_a_late_request_is_sent_if_the_next_time_slot_is_not_due_yet(drive: Drive) -> None:
-    with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
-        rows, now = Rows(port), now_ns()
-        poll = read(1, period=1.0)
-        port.submit([poll, poll], [now - 5_000_000_000, now + 60_000_000_000])
-        assert rows.of("status", 1) == [0]
+def test_a_late_request_is_sent_if_the_next_time_slot_is_not_due_yet(port: Port) -> None:
+    rows, now = Rows(port), now_ns()
+    poll = read(1, period=1.0)
+    port.submit([poll, poll], [now - 5_000_000_000, now + 60_000_000_000])
+    assert rows.of("status", 1) == [0]
 
 
-def test_repeat_repeats_exchanges_until_they_are_replaced(drive: Drive) -> None:
-    with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
-        rows = Rows(port)
-        port.repeat([read(0), read(1), read(2)])
-        assert port.repeating
-        assert rows.of("value", 30)[:30] == [0, 1, 2] * 10
-        port.repeat([read(7)])
-        so_far = len(rows.of("value", 30))
-        assert rows.of("value", so_far + 10)[-1] == 7
-        port.repeat([])
-        assert not port.repeating
-        assert status_of(port.carry_out(read(9))) == 0
+def test_repeat_repeats_exchanges_until_they_are_replaced(port: Port, rows: Rows) -> None:
+    port.repeat([read(0), read(1), read(2)])
+    assert port.repeating
+    assert rows.of("value", 30)[:30] == [0, 1, 2] * 10
+    port.repeat([read(7)])
+    so_far = len(rows.of("value", 30))
+    assert rows.of("value", so_far + 10)[-1] == 7
+    port.repeat([])
+    assert not port.repeating
+    assert status_of(port.carry_out(read(9))) == 0
 
 
-def test_repeat_returns_the_index_of_the_exchange_that_would_have_been_next(drive: Drive) -> None:
-    with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
-        rows = Rows(port)
-        port.repeat([read(0), read(1), read(2)])
-        rows.of("value", 20)
-        following = port.repeat([])
-        port.carry_out(read(9))  # carried out after the exchange in flight
-        assert following == (rows.of("value", 20)[-1] + 1) % 3
+def test_repeat_returns_the_index_of_the_exchange_that_would_have_been_next(port: Port, rows: Rows) -> None:
+    port.repeat([read(0), read(1), read(2)])
+    rows.of("value", 20)
+    following = port.repeat([])
+    port.carry_out(read(9))  # carried out after the exchange in flight
+    assert following == (rows.of("value", 20)[-1] + 1) % 3
 
 
-def test_queued_exchanges_are_carried_out_between_repeated_exchanges(drive: Drive) -> None:
-    with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
-        rows = Rows(port)
-        port.repeat([read(0)])
-        queued, due_ns = [read(1), read(2)], now_ns() + 20_000_000
-        port.submit(queued, [due_ns, due_ns])
-        wait_until(lambda: not pending(port))
-        port.stop()
-        values, sent = rows.of("value", 3), rows.of("sent", 3)
+def test_queued_exchanges_are_carried_out_between_repeated_exchanges(port: Port, rows: Rows) -> None:
+    port.repeat([read(0)])
+    queued, due_ns = [read(1), read(2)], now_ns() + 20_000_000
+    port.submit(queued, [due_ns, due_ns])
+    wait_until(lambda: not pending(port))
+    port.stop()
+    values, sent = rows.of("value", 3), rows.of("sent", 3)
     assert values[0] == 0  # repeated exchanges went on until the queued one was due
     at = values.index(1)
     assert values[at + 1] == 2
@@ -326,31 +329,29 @@ def test_await_calls_returns_when_a_drive_refuses_and_when_a_port_is_lost() -> N
         assert row_queue.await_calls(60) == [3]
 
 
-def test_rows_dropped_from_a_full_queue_are_counted(drive: Drive) -> None:
-    with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
-        row_queue = RowQueue(chunk_rows=10, most_chunks=2)
-        port.report_to(row_queue, 0)
-        queued = [read(start) for start in range(35)]
-        port.submit(queued, [0] * 35)
-        wait_until(lambda: not pending(port))
-        assert (row_queue.chunks, row_queue.dropped) == (2, 20)
-        kept = [columns for columns in (row_queue.take(), row_queue.take()) if columns]
-        assert [each for columns in kept for each in columns.array("value")] == [*range(10), *range(30, 35)]
+def test_rows_dropped_from_a_full_queue_are_counted(port: Port) -> None:
+    row_queue = RowQueue(chunk_rows=10, most_chunks=2)
+    port.report_to(row_queue, 0)
+    queued = [read(start) for start in range(35)]
+    port.submit(queued, [0] * 35)
+    wait_until(lambda: not pending(port))
+    assert (row_queue.chunks, row_queue.dropped) == (2, 20)
+    kept = [columns for columns in (row_queue.take(), row_queue.take()) if columns]
+    assert [each for columns in kept for each in columns.array("value")] == [*range(10), *range(30, 35)]
 
 
-def test_a_memoryview_of_rows_outlives_the_object_that_made_it(drive: Drive) -> None:
-    with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
-        row_queue = RowQueue()
-        port.report_to(row_queue, 0)
-        queued = [read(start) for start in range(100)]
-        port.submit(queued, [0] * 100)
-        wait_until(lambda: not pending(port))
-        columns = row_queue.take()
-        assert columns is not None
-        values = columns.array("value")
-        del columns, row_queue
-        gc.collect()
-        assert list(values) == list(range(100))
+def test_a_memoryview_of_rows_outlives_the_object_that_made_it(port: Port) -> None:
+    row_queue = RowQueue()
+    port.report_to(row_queue, 0)
+    queued = [read(start) for start in range(100)]
+    port.submit(queued, [0] * 100)
+    wait_until(lambda: not pending(port))
+    columns = row_queue.take()
+    assert columns is not None
+    values = columns.array("value")
+    del columns, row_queue
+    gc.collect()
+    assert list(values) == list(range(100))
 
 
 def test_columns_of_rows_outlive_their_queue(drive: Drive) -> None:
@@ -415,13 +416,12 @@ def test_a_configured_echo_needs_no_probe(drive: Drive, echo: Echo) -> None:
     assert requested == [7]
 
 
-def test_an_urgent_exchange_is_sent_before_the_queue(drive: Drive) -> None:
-    with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
-        waiting = [read(0)]
-        port.submit(waiting, [now_ns() + 60_000_000_000])
-        found = port.carry_out(read(7))
-        assert (found.result, found.reply.data) == (7, words(7))
-        assert pending(port) == 1
+def test_an_urgent_exchange_is_sent_before_the_queue(port: Port) -> None:
+    waiting = [read(0)]
+    port.submit(waiting, [now_ns() + 60_000_000_000])
+    found = port.carry_out(read(7))
+    assert (found.result, found.reply.data) == (7, words(7))
+    assert pending(port) == 1
 
 
 def test_carry_out_returns_the_values_of_the_reply(drive: Drive) -> None:
@@ -438,13 +438,12 @@ def test_carry_out_returns_the_values_of_the_reply(drive: Drive) -> None:
         assert again.numbers[1] != again.numbers[1]
 
 
-def test_result_memory_that_is_too_small_for_the_values_is_not_reused(drive: Drive) -> None:
-    with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
-        short = Completion()
-        found = port.carry_out(read(7, values=ONE_VALUE), into=short)
-        assert found is not short
-        assert found.numbers.tolist() == [7]
-        assert short.result == 0
+def test_result_memory_that_is_too_small_for_the_values_is_not_reused(port: Port) -> None:
+    short = Completion()
+    found = port.carry_out(read(7, values=ONE_VALUE), into=short)
+    assert found is not short
+    assert found.numbers.tolist() == [7]
+    assert short.result == 0
 
 
 def test_an_urgent_exchange_that_has_already_expired_is_not_sent(drive: Drive) -> None:
@@ -649,12 +648,10 @@ def test_a_port_is_served_on_time_after_another_port_was_closed(drive: Drive) ->
         until(lambda: not pending(port))
 
 
-def test_queued_exchanges_are_kept_alive_until_they_end(drive: Drive) -> None:
-    with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
-        rows = Rows(port)
-        port.submit([read(1), read(2)], [now_ns() + 20_000_000] * 2)
-        gc.collect()
-        assert rows.of("value", 2) == [1, 2]
+def test_queued_exchanges_are_kept_alive_until_they_end(port: Port, rows: Rows) -> None:
+    port.submit([read(1), read(2)], [now_ns() + 20_000_000] * 2)
+    gc.collect()
+    assert rows.of("value", 2) == [1, 2]
 
 
 def test_the_result_of_an_exception_reply_has_the_exception_code(drive: Drive) -> None:

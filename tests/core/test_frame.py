@@ -64,8 +64,7 @@ def carry_out(framing: Framing, request: Message, received: bytes, piece: int = 
     """Return the result of a request that is followed by these bytes, through an adapter without echo."""
     line = LineDriver()
     line.echo = lib.MD_NO_ECHO
-    line.begin(exchange(framing, request))
-    line.wait_until_write()
+    line.send(exchange(framing, request))
     line.receive(received, piece)
     line.wait_until_done()
     return line.completion
@@ -236,8 +235,7 @@ def test_a_wrong_reply_ends_with_its_fault_and_without_data(
 def test_a_stray_zero_before_each_reply_loses_no_value() -> None:
     line = LineDriver()
     for value in range(30):
-        line.begin(exchange(RTU, READ_TWO))
-        line.wait_until_write()
+        line.send(exchange(RTU, READ_TWO))
         line.receive(b"\x00" + rtu(f"01 03 04 {value:04X} 00 00"))
         line.wait_until_done()
         assert line.completion.reply.data == words(value, 0)

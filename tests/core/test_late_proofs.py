@@ -33,11 +33,6 @@ def time_out(line: LineDriver, drive: Peer, request: Message) -> None:
     line.now = drive.late_until_ns + MS
 
 
-def send(line: LineDriver, asked: Exchange) -> None:
-    line.begin(asked)
-    line.wait_until_write()
-
-
 def is_barred(line: LineDriver, drive: Peer, request: Message) -> bool:
     line.begin(exchange(request, drive))
     return line.want == "done" and line.completion.result == Failure.LATE_ANSWER_DUE
@@ -62,22 +57,20 @@ def test_a_write_waits_for_the_reply_to_an_earlier_write(line: LineDriver, drive
 def test_after_the_reply_to_a_proof_no_late_reply_is_expected(
     line: LineDriver, drive: Peer, proof: Exchange, late: int
 ) -> None:
-    send(line, proof)
+    line.send(proof)
     for _ in range(late):  # a late reply before that of the proof is skipped
         line.receive(reply(1111))
         assert line.listens
     assert drive.counters().late == late
-    line.receive(PROOF_REPLY)
-    assert (line.want, line.completion.reply.data) == ("done", words(4, 5))
+    assert line.data_after(PROOF_REPLY) == words(4, 5)
     ask(line, drive, OTHER)
-    line.receive(reply(2222))
-    assert (line.want, line.completion.reply.data) == ("done", words(2222))
+    assert line.data_after(reply(2222)) == words(2222)
 
 
 def test_after_an_unanswered_proof_the_late_reply_is_still_expected(
     line: LineDriver, drive: Peer, proof: Exchange
 ) -> None:
-    send(line, proof)
+    line.send(proof)
     line.wait_until_done()
     assert line.completion.result == Failure.NO_REPLY
     line.now = drive.late_until_ns + MS
@@ -90,7 +83,7 @@ def ask_in_vain(line: LineDriver, drive: Peer, proof: Exchange) -> None:
     line.receive(build_reply(Framing.RTU, Message(1, 4, data=words(2222))))
     assert line.completion.result > 0
     time_out(line, drive, READ)
-    send(line, proof)
+    line.send(proof)
     line.wait_until_done()
     assert line.completion.result == Failure.NO_REPLY
     line.now = drive.late_until_ns + MS
@@ -113,7 +106,7 @@ def test_a_proof_that_was_answered_once_is_always_kept(
     if is_late:
         ask_in_vain(line, drive, proof)
     else:
-        send(line, proof)
+        line.send(proof)
     line.receive(PROOF_REPLY)
     for _ in range(3):
         ask_in_vain(line, drive, proof)
@@ -124,7 +117,7 @@ def test_a_drive_that_answers_no_request_keeps_its_proofs(
     line: LineDriver, drive: Peer, proof: Exchange
 ) -> None:
     for _ in range(3):
-        send(line, proof)
+        line.send(proof)
         line.wait_until_done()
         line.now = drive.late_until_ns + MS
     assert is_barred(line, drive, OTHER)
@@ -135,7 +128,7 @@ def test_a_stop_does_not_wait_for_the_reply_to_a_proof(line: LineDriver, drive: 
     time_out(line, drive, WRITE)
     stop = exchange(AGAIN, drive)
     stop.c.insists = 1
-    send(line, stop)
+    line.send(stop)
 
 
 @pytest.mark.usefixtures("proof")
@@ -173,8 +166,7 @@ def test_a_reply_is_found_after_a_late_reply_that_came_during_its_request(
     line.receive(reply(1111))
     assert drive.counters().late == 1
     line.take()
-    line.receive(build_reply(Framing.RTU, Message(1, 4, data=words(2222))))
-    assert (line.want, line.completion.reply.data) == ("done", words(2222))
+    assert line.data_after(build_reply(Framing.RTU, Message(1, 4, data=words(2222)))) == words(2222)
 
 
 @pytest.mark.usefixtures("proof")
@@ -187,8 +179,7 @@ def test_a_reply_is_found_after_noise_before_its_request(line: LineDriver, drive
     line.receive(reply(1111))
     assert drive.counters().late == 1
     line.take()
-    line.receive(build_reply(Framing.RTU, Message(1, 4, data=words(2222))))
-    assert (line.want, line.completion.reply.data) == ("done", words(2222))
+    assert line.data_after(build_reply(Framing.RTU, Message(1, 4, data=words(2222)))) == words(2222)
 
 
 # ---- sure replies can only be to the last request: the core checks the driver's count of unsent bytes ----
@@ -215,7 +206,7 @@ def test_a_reply_is_in_doubt_if_it_may_answer_another_request(line: LineDriver, 
 def test_no_reply_is_in_doubt_after_the_reply_to_a_proof(
     line: LineDriver, drive: Peer, proof: Exchange
 ) -> None:
-    send(line, proof)
+    line.send(proof)
     line.receive(PROOF_REPLY)
     assert has_sure_reply(line, drive)
 
@@ -242,13 +233,12 @@ def test_the_first_reply_is_in_doubt_until_a_proof_is_answered(
     ask(line, drive, READ)
     line.receive(reply(7777))  # the reply to the other process
     assert is_in_doubt(line)
-    send(line, first)
+    line.send(first)
     line.receive(reply(1111))  # the reply to READ
     assert line.listens
     line.receive(PROOF_REPLY)
     ask(line, drive, READ)
-    line.receive(reply(1112))
-    assert (line.want, line.completion.reply.data) == ("done", words(1112))
+    assert line.data_after(reply(1112)) == words(1112)
     assert drive.counters().late == 0  # this drive has answered each request in time
 
 
@@ -277,7 +267,7 @@ def test_a_stop_accepts_a_first_reply_that_is_in_doubt(line: LineDriver, drive: 
     for request, came in ((READ, reply(1)), (WRITE, build_reply(Framing.RTU, WRITE))):
         asked = exchange(request, drive)
         asked.c.insists = 1
-        send(line, asked)
+        line.send(asked)
         line.receive(came)
         assert line.completion.result > 0
 
@@ -285,8 +275,7 @@ def test_a_stop_accepts_a_first_reply_that_is_in_doubt(line: LineDriver, drive: 
 def test_the_first_reply_is_accepted_if_the_drive_has_no_proofs(line: LineDriver, drive: Peer) -> None:
     drive.doubt_first_reply()
     ask(line, drive, READ)
-    line.receive(reply(1111))
-    assert (line.want, line.completion.reply.data) == ("done", words(1111))
+    assert line.data_after(reply(1111)) == words(1111)
 
 
 @pytest.mark.parametrize("least", [0, 1, 0xFFFF])
@@ -295,8 +284,7 @@ def test_a_known_value_of_any_size_identifies_a_reply(line: LineDriver, drive: P
     known = exchange(READ, drive, answer=(least, least))
     drive.prove_by([known, exchange(OTHER, drive, answer=(7, 7))])
     time_out(line, drive, Message(1, 3, 90, 1))
-    send(line, known)
+    line.send(known)
     line.receive(reply(7))
     assert line.listens
-    line.receive(reply(least))
-    assert (line.want, line.completion.reply.data) == ("done", words(least))
+    assert line.data_after(reply(least)) == words(least)

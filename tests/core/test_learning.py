@@ -67,8 +67,7 @@ def looks(
     line: LineDriver, drive: Peer, delay: int, details: dict[str, RowLayout] | None = None
 ) -> tuple[int, int]:
     """Carry out an exchange. Return how often the port was read, and how late after the reply's end (ns)."""
-    line.begin(exchange(READ, drive, **(details or {})))
-    line.wait_until_write()
+    line.send(exchange(READ, drive, **(details or {})))
     left = line.now + 8 * CHARACTER
     times = [left + delay + (at + 1) * CHARACTER for at in range(len(reply()))]
     seen = found = 0
@@ -166,8 +165,7 @@ def test_a_write_waits_at_least_its_own_timeout_for_its_reply(line: LineDriver, 
     for _ in range(12):
         answer(line, drive, 2 * MS)
     assert given_up(line, drive) < 100 * MS
-    line.begin(exchange(WRITE, drive, timeout=1.0))
-    line.wait_until_write()
+    line.send(exchange(WRITE, drive, timeout=1.0))
     left = line.now + 8 * CHARACTER
     line.wait_until_done()
     assert line.now - left == 1000 * MS + 8 * CHARACTER
@@ -286,13 +284,11 @@ def test_a_polled_value_that_may_be_late_has_the_time_of_the_earlier_request(
     drive.prove_by([exchange(LONGER, drive), exchange(Message(1, 3, 0, 3), drive)])
     rows = RowLayout(0, [Field(0, NumberFormat.U16, 0, 1.0, 1.0)]) if is_row else None
     asked = exchange(READ, drive, block=rows)
-    line.begin(asked)
-    line.wait_until_write()
+    line.send(asked)
     first_ns = line.completion.sent_ns
     line.wait_until_done()
     line.now = drive.late_until_ns
-    line.begin(asked)
-    line.wait_until_write()
+    line.send(asked)
     line.now += 20 * MS
     line.receive(reply(1234))
     assert line.want == "done"
@@ -382,8 +378,7 @@ def delixi(function: int, start: int, value: int = 0) -> Message:
 def test_a_delixi_request_waits_for_a_late_reply_that_could_be_its_own(
     line: LineDriver, drive: Peer, first: Message, second: Message
 ) -> None:
-    line.begin(exchange(first, drive, Framing.DELIXI))
-    line.wait_until_write()
+    line.send(exchange(first, drive, Framing.DELIXI))
     line.wait_until_done()
     assert line.completion.result == Failure.NO_REPLY
     line.begin(exchange(second, drive, Framing.DELIXI))
@@ -392,8 +387,7 @@ def test_a_delixi_request_waits_for_a_late_reply_that_could_be_its_own(
 
 def test_a_late_reply_to_a_write_is_expected_after_the_writes_timeout(line: LineDriver, drive: Peer) -> None:
     """Otherwise a late exception to this write would be taken for a refusal of the next write."""
-    line.begin(exchange(WRITE, drive, timeout=5 * MOST / 1e9))
-    line.wait_until_write()
+    line.send(exchange(WRITE, drive, timeout=5 * MOST / 1e9))
     line.wait_until_done()
     line.now += 3 * LEAST
     assert is_barred(line, drive, Message(1, 6, 9, data=words(1)))
@@ -405,8 +399,7 @@ def test_a_stop_does_not_wait_for_late_replies(line: LineDriver, drive: Peer) ->
     time_out(line, drive, WRITE)
     stop = exchange(WRITE, drive)
     stop.c.insists = 1
-    line.begin(stop)
-    assert line.wait_until_write() == build_request(Framing.RTU, WRITE)
+    assert line.send(stop) == build_request(Framing.RTU, WRITE)
 
 
 def test_the_timeout_of_a_stop_doubles_from_its_second_failure_on(line: LineDriver, drive: Peer) -> None:
@@ -419,8 +412,7 @@ def test_the_timeout_of_a_stop_doubles_from_its_second_failure_on(line: LineDriv
     for _ in range(5):
         stop = exchange(WRITE, drive)
         stop.c.insists = 1
-        line.begin(stop)
-        line.wait_until_write()
+        line.send(stop)
         left = line.now + 8 * CHARACTER
         line.wait_until_done()
         found.append((line.now - left - 8 * CHARACTER) // MS)

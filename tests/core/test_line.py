@@ -68,8 +68,7 @@ def line() -> LineDriver:
 
 def ask(line: LineDriver, request: Message = READ) -> None:
     """Send the request. Afterwards the clock is at the request's first bit."""
-    line.begin(exchange(request))
-    line.wait_until_write()
+    line.send(exchange(request))
 
 
 def answer(line: LineDriver, received: bytes, piece: int = 4096) -> None:
@@ -134,13 +133,11 @@ def test_no_request_is_sent_before_the_required_silence_has_passed(line: LineDri
 def test_the_silence_between_two_exchanges_is_the_longer_of_their_silences(
     line: LineDriver, before: int, after: int
 ) -> None:
-    line.begin(exchange(READ, silence=before * MS))
-    line.wait_until_write()
+    line.send(exchange(READ, silence=before * MS))
     line.now += 20 * MS
     answer(line, reply_of(1))
     ended = line.now
-    line.begin(exchange(READ, silence=after * MS))
-    line.wait_until_write()
+    line.send(exchange(READ, silence=after * MS))
     assert line.now == ended + max(before, after) * MS
 
 
@@ -204,8 +201,7 @@ def test_silence_starts_after_the_requests_last_bit(line: LineDriver) -> None:
     ask(line)
     sent = line.now
     answer(line, reply_of(1))
-    line.begin(exchange(READ))
-    line.wait_until_write()
+    line.send(exchange(READ))
     assert line.now == sent + 8 * CHARACTER + SILENCE
 
 
@@ -348,8 +344,7 @@ def test_a_reply_that_is_read_at_the_timeout_is_accepted(line: LineDriver) -> No
     assert line.listens
     line.now = line.wake + 50 * MS
     assert line.listens
-    line.receive(reply_of(3))
-    assert (line.want, line.completion.reply.data) == ("done", words(3))
+    assert line.data_after(reply_of(3)) == words(3)
 
 
 def test_an_exchange_ends_after_one_read_at_its_timeout(line: LineDriver) -> None:
@@ -468,28 +463,21 @@ def test_a_broadcast_ends_when_it_is_sent_and_the_turnaround_delay_follows(line:
     sent = line.now
     assert line.want == "done"
     assert (line.completion.result, line.completion.sent_ns, line.completion.first_ns) == (0, sent, 0)
-    line.begin(exchange(READ))
-    line.wait_until_write()
+    line.send(exchange(READ))
     assert line.now == sent + 8 * CHARACTER + TURNAROUND
 
 
-def test_noise_does_not_shorten_the_turnaround_delay(line: LineDriver) -> None:
+@pytest.mark.parametrize("event", ["noise while it is sent", "a failed unsent exchange"])
+def test_the_turnaround_delay_is_never_shortened(line: LineDriver, event: str) -> None:
     ask(line, BROADCAST)
     sent = line.now
-    line.now += MS
-    line.receive(b"\xff")  # noise while the broadcast is still being sent
-    line.begin(exchange(READ))
-    line.wait_until_write()
-    assert line.now == sent + 8 * CHARACTER + TURNAROUND
-
-
-def test_a_failed_unsent_exchange_does_not_cancel_the_turnaround_delay(line: LineDriver) -> None:
-    ask(line, BROADCAST)
-    sent = line.now
-    line.begin(exchange(READ))
-    line.lose(errno.EIO)
-    line.begin(exchange(READ))
-    line.wait_until_write()
+    if event == "noise while it is sent":
+        line.now += MS
+        line.receive(b"\xff")
+    else:
+        line.begin(exchange(READ))
+        line.lose(errno.EIO)
+    line.send(exchange(READ))
     assert line.now == sent + 8 * CHARACTER + TURNAROUND
 
 
@@ -504,8 +492,7 @@ def test_a_reply_after_another_masters_read_is_not_accepted(line: LineDriver, pi
     ask(line)
     line.receive(rtu("01 03 00 40 00 01") + reply_of(0x1234), piece)
     assert line.listens
-    line.receive(reply_of(7), piece)
-    assert (line.want, line.completion.reply.data) == ("done", words(7))
+    assert line.data_after(reply_of(7), piece) == words(7)
     line.now += 10 * MS
     found = exchanged(line, rtu("01 03 00 40 00 01") + reply_of(0x1234), piece=piece)
     assert found.result == Failure.NO_REPLY
@@ -534,16 +521,15 @@ def test_the_echo_of_a_write_is_not_taken_for_its_confirmation(line: LineDriver,
     assert (line.completion.result, line.completion.skipped) == (8, 8)
 
 
-def test_an_echo_without_a_reply_does_not_confirm_a_write(line: LineDriver) -> None:
+@pytest.mark.parametrize(
+    ("after", "result", "reply"),
+    [(b"", Failure.NO_REPLY, Message(0, 0)), (rtu("01 86 02"), 5, Message(1, 0x06, exception=2))],
+    ids=["nothing", "an exception"],
+)
+def test_the_echo_of_a_write_is_skipped(line: LineDriver, after: bytes, result: int, reply: Message) -> None:
     teach_echo(line)
-    found = exchanged(line, confirmation(), WRITE)
-    assert (found.result, found.reply) == (Failure.NO_REPLY, Message(0, 0))
-
-
-def test_an_exception_is_found_after_the_echo_of_a_write(line: LineDriver) -> None:
-    teach_echo(line)
-    found = exchanged(line, confirmation() + rtu("01 86 02"), WRITE)
-    assert (found.result, found.reply) == (5, Message(1, 0x06, exception=2))
+    found = exchanged(line, confirmation() + after, WRITE)
+    assert (found.result, found.reply) == (result, reply)
 
 
 def test_an_echo_that_starts_before_the_request_is_sent_is_recognised(line: LineDriver) -> None:
@@ -639,8 +625,7 @@ def test_a_configured_echo_is_expected_even_after_replies_without_an_echo(line: 
 def test_the_configured_echo_of_a_delixi_query_is_not_taken_for_a_value(line: LineDriver) -> None:
     query, value = Message(1, 0x07, 0x01F4, data=bytes(4)), b"\0\0\x13\x88"
     line.set_echo(lib.MD_ECHO)
-    line.begin(exchange(query, framing=Framing.DELIXI))
-    line.wait_until_write()
+    line.send(exchange(query, framing=Framing.DELIXI))
     reply = build_reply(Framing.DELIXI, replace(query, data=value))
     answer(line, build_request(Framing.DELIXI, query) + reply)
     assert (line.completion.reply.data, line.completion.skipped) == (value, 21)
@@ -681,13 +666,11 @@ def test_a_delixi_value_of_0_is_found_after_the_echo_of_its_query(line: LineDriv
     """A query's echo equals a reply with the value 0. A state query has no such reply, and shows the echo."""
     state, ask_state = b":010300030000000007\r\n", b":010300000000000004\r\n"
     value, ask_value = b":010701F40000138898\r\n", b":010701F400000000FD\r\n"
-    line.begin(exchange(Message(1, 3, 0, data=words(0, 0)), framing=Framing.DELIXI))
-    assert line.wait_until_write() == ask_state
+    assert line.send(exchange(Message(1, 3, 0, data=words(0, 0)), framing=Framing.DELIXI)) == ask_state
     answer(line, ask_state + state)
     assert line.completion.reply.start == 3
     for reply, frequency in ((value, 5000), (ask_value, 0)):
-        line.begin(exchange(Message(1, 7, 500, data=words(0, 0)), framing=Framing.DELIXI))
-        assert line.wait_until_write() == ask_value
+        assert line.send(exchange(Message(1, 7, 500, data=words(0, 0)), framing=Framing.DELIXI)) == ask_value
         answer(line, ask_value + reply)
         assert (line.completion.reply.data, line.completion.skipped) == (words(0, frequency), 21)
 
@@ -698,11 +681,9 @@ ECHO = build_request(Framing.DELIXI, QUERY)  # as a reply it means the value 0
 
 def query(line: LineDriver) -> None:
     """Query a Delixi drive's state, whose reply shows that there is no echo, and then a parameter."""
-    line.begin(exchange(Message(1, 3, 0, data=words(0, 0)), framing=Framing.DELIXI))
-    line.wait_until_write()
+    line.send(exchange(Message(1, 3, 0, data=words(0, 0)), framing=Framing.DELIXI))
     answer(line, b":010300030000000007\r\n")
-    line.begin(exchange(QUERY, framing=Framing.DELIXI))
-    line.wait_until_write()
+    line.send(exchange(QUERY, framing=Framing.DELIXI))
 
 
 @pytest.mark.parametrize("piece", [4096, 1], ids=["whole", "byte by byte"])

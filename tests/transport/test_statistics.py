@@ -147,8 +147,7 @@ def test_each_outcome_is_counted_in_the_counters_of_the_modbus_guide(
 
 
 def test_noise_on_an_ascii_line_is_counted_as_communication_error(line: LineDriver, drive: Peer) -> None:
-    line.begin(exchange(READ, drive, Framing.ASCII))
-    line.wait_until_write()
+    line.send(exchange(READ, drive, Framing.ASCII))
     line.receive(b"\xff\xff")
     line.wait_until_done()
     assert counted(drive) == DAMAGED

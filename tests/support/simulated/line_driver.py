@@ -102,6 +102,17 @@ class LineDriver:
             self.now = max(self.now, self.wake)
         raise AssertionError("the line never wants to write")
 
+    def send(self, exchange: Exchange) -> bytes:
+        """Start an exchange and wait until its request is sent; return the request's bytes."""
+        self.begin(exchange)
+        return self.wait_until_write()
+
+    def data_after(self, received: bytes, piece: int = 4096) -> bytes:
+        """Receive bytes that end the exchange; return the data of its reply."""
+        self.receive(received, piece)
+        assert self.want == "done"
+        return self.completion.reply.data
+
     def wait_for_look(self) -> None:
         """Advance time until the line's next read is due."""
         while self.want == "wait":
@@ -151,8 +162,7 @@ def reply(value: int = 0) -> bytes:
 
 def ask(line: LineDriver, drive: Peer, request: Message = READ) -> int:
     """Send the request to the drive; return the time in ns at which its last bit has left."""
-    line.begin(exchange(request, drive))
-    line.wait_until_write()
+    line.send(exchange(request, drive))
     return line.now + 8 * CHARACTER
 
 
