@@ -36,7 +36,6 @@ LINES = {  # line name: (name, model, framing) of each of its drives
         ("fan-2", "innovert-ibd", "rtu"),
         ("fan-3", "innovert-ibd", "ascii"),
         ("fan-4", "delta-vfd-el", "rtu"),
-        ("mixer-2", "yd1000", "rtu"),
     ),
     "belts": (
         ("belt-1", "delixi-modbus", "rtu"),
@@ -46,15 +45,16 @@ LINES = {  # line name: (name, model, framing) of each of its drives
         ("belt-5", "invt-che", "rtu"),
         ("belt-6", "delta-ms300", "rtu"),
         ("belt-7", "optidrive-e3", "rtu"),
+        ("mixer-2", "yd1000", "rtu"),
     ),
 }
 DRIVES = [name for drives in LINES.values() for name, *_ in drives]
-POLLED = ("status", "terminals", "output_frequency", "output_current", "fault", "last_fault")
+POLLED = ("status", "terminals", "output_frequency", "output_current")
 # By model: the registers to poll instead of POLLED. At 9600 bit/s, a YD1000 has time for two requests.
 POLLED_OF = {"yd1000": ("status", "output_frequency")}
-# settings of output terminals, which are polled with the period SLOW
-SLOWLY = ("output_m01", "output_m02", "output_yabc", "output_virtual")
-EVERY, SLOW = "450 ms", "2 s"
+# faults, and settings of output terminals, which are polled with the period SLOW
+SLOWLY = ("fault", "last_fault", "output_m01", "output_m02", "output_yabc", "output_virtual")
+EVERY, SLOW = "500 ms", "2 s"
 MAXIMUM_HZ = 50
 TROUBLE = {  # the faults that some drives of the demo simulate
     "fan-1": 'trip = "30 s"\nfirst = "3 s"',
@@ -64,6 +64,7 @@ TROUBLE = {  # the faults that some drives of the demo simulate
     "fan-3": "loss = 0.02",
 }
 DRIFT = 0.25  # each simulated load moves up and down by this fraction of the rated torque
+FIRST_STEP_S = 0.25  # pause between the first starts of a line's motors
 STEP_S = 0.8  # pause before the operator turns to the next drive of a line
 CALM = 3  # when the operator visits a running motor, one visit in CALM changes the setpoint, on average
 
@@ -93,12 +94,13 @@ def _plant_tables(folder: Path) -> Iterator[str]:
 
 def _polled(family: type[Drive]) -> Iterator[str]:
     """Yield the entries of a drive's key `poll`: registers whose values have a name or a unit."""
-    wanted = POLLED_OF.get(family.model, POLLED)
-    found = [family.registers[name] for name in wanted if name in family.registers]
-    yield from (f'"{one.name}"' for one in found if one.step is not None or one.values is not None)
-    for name in SLOWLY:
-        if name in family.registers:
-            yield f'{{ register = "{name}", every = "{SLOW}" }}'
+    entries = {
+        '"{}"': POLLED_OF.get(family.model, POLLED),
+        f'{{{{ register = "{{}}", every = "{SLOW}" }}}}': SLOWLY,
+    }
+    for entry, names in entries.items():
+        found = [family.registers[name] for name in names if name in family.registers]
+        yield from (entry.format(one.name) for one in found if one.step is not None or one.values is not None)
 
 
 def _port(link: Path) -> str:
@@ -132,6 +134,7 @@ class Operator:
         drives = list(bus.drives)
         for drive in drives:
             self._attempt(_start, drive)
+            self._is_over.wait(FIRST_STEP_S)
         for drive in cycle(drives):
             if self._is_over.wait(STEP_S):
                 return
