@@ -144,9 +144,7 @@ def test_the_help_imports_no_command_and_no_large_library() -> None:
         ),
     ],
 )
-def test_a_mistaken_command_is_reported_in_one_sentence_with_status_2(
-    run: Run, words: list[str], sentence: str
-) -> None:
+def test_a_mistaken_command_is_one_sentence_with_status_2(run: Run, words: list[str], sentence: str) -> None:
     assert run(*words) == (2, "", f"multidrop: {sentence}\n")
 
 
@@ -218,9 +216,7 @@ def test_a_file_in_place_of_the_directory_of_ports_is_refused(run: Run, tmp_path
     )
 
 
-def test_a_missing_ledger_file_is_reported_with_the_default_path(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_ledger_file_is_reported(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", "/state")
     sentence = f"there is no ledger {tmp_path}/none; the default is /state/multidrop/wear.sqlite"
     assert run("wear", "--ledger", tmp_path / "none") == (2, "", f"multidrop: {sentence}\n")
@@ -258,9 +254,7 @@ def test_a_missing_ledger_file_is_reported_with_the_default_path(
         ),
     ],
 )
-def test_a_forbidden_write_is_reported_in_one_sentence_with_status_1(
-    run: Run, words: list[str], sentence: str
-) -> None:
+def test_a_forbidden_write_is_one_sentence_with_status_1(run: Run, words: list[str], sentence: str) -> None:
     assert run(*words) == (1, "", f"multidrop: {sentence}\n")
 
 
@@ -278,9 +272,7 @@ def test_a_forbidden_write_is_reported_in_one_sentence_with_status_1(
         ),
     ],
 )
-def test_a_forbidden_write_shows_the_command_or_option_to_use_instead(
-    run: Run, words: list[str], advice: str
-) -> None:
+def test_a_forbidden_write_names_the_right_command_or_option(run: Run, words: list[str], advice: str) -> None:
     status, out, err = run(*words)
     assert (status, out) == (1, "")
     assert advice in err
@@ -331,9 +323,7 @@ def test_each_kind_of_advice_in_errors_has_a_command_that_replaces_it() -> None:
         ("/dev/null", "/dev/null: it is not a serial port"),
     ],
 )
-def test_a_port_that_cannot_be_opened_is_reported_in_one_sentence_with_status_1(
-    run: Run, port: str, sentence: str
-) -> None:
+def test_a_port_that_cannot_be_opened_is_one_sentence_with_status(run: Run, port: str, sentence: str) -> None:
     assert run("read", port, TOY, 1) == (1, "", f"multidrop: {sentence}\n")
 
 

@@ -132,9 +132,7 @@ class Mute(Drive):
 """
 
 
-def test_a_drive_whose_state_cannot_be_read_is_stopped(
-    run: Run, port: str, toy: SimulatedDrive, tmp_path: Path
-) -> None:
+def test_a_stop_needs_no_readable_state(run: Run, port: str, toy: SimulatedDrive, tmp_path: Path) -> None:
     (tmp_path / "mute.py").write_text(MUTE)
     words = ("stop", port, f"{tmp_path}/mute.py:Mute", 1)
     status, out, err = run(*words)
@@ -163,9 +161,7 @@ def test_write_prints_its_outcome_on_one_line(run: Run, port: str, toy: Simulate
     assert toy["frequency"] == 25
 
 
-def test_a_write_for_a_stopped_motor_is_refused_while_it_runs(
-    run: Run, port: str, toy: SimulatedDrive
-) -> None:
+def test_a_write_for_a_stopped_motor_fails_while_it_runs(run: Run, port: str, toy: SimulatedDrive) -> None:
     status, out, err = run("write", port, TOY, 1, "acceleration_time", "12.5", "--yes")
     assert (status, out) == (1, "")
     assert "acceleration_time of toy@1 is not written: it can be written only at standstill" in err
@@ -199,9 +195,7 @@ def test_a_rounding_error_of_a_calculated_value_is_not_reported(capsys: pytest.C
     assert "24.0099998 becomes 24.01 %" in capsys.readouterr().err
 
 
-def test_a_value_between_two_steps_is_rounded_with_a_warning(
-    run: Run, port: str, toy: SimulatedDrive
-) -> None:
+def test_a_value_between_two_steps_is_rounded_with_warning(run: Run, port: str, toy: SimulatedDrive) -> None:
     """The rounded value is sent to the drive and reported to the user."""
     note = "multidrop: frequency has steps of 0.01 Hz: 12.345 becomes 12.34 Hz\n"
     assert run("write", port, TOY, 1, "frequency", "12.345", "--yes") == (

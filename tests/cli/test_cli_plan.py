@@ -130,9 +130,7 @@ def test_a_drive_without_a_rate_gets_time_on_an_overloaded_line(run: Run, crowde
 
 
 @pytest.mark.parametrize("model", ["yd1000", "delixi-modbus"])
-def test_polling_all_readings_in_single_requests_causes_a_warning(
-    run: Run, tmp_path: Path, model: str
-) -> None:
+def test_plan_warns_of_polling_each_reading_by_its_own_request(run: Run, tmp_path: Path, model: str) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(LINE.format("hall-1", 1) + DRIVE.format("p", model, 1) + DRIVE.format("q", model, 2))
     status, out, _ = run("plan", path)

@@ -115,9 +115,7 @@ def test_a_command_uses_the_settings_in_the_plant_file(run: Run, plant: Path, at
         ),
     ],
 )
-def test_a_mistaken_name_or_option_is_reported_in_one_sentence(
-    run: Run, plant: Path, words: list[str], sentence: str
-) -> None:
+def test_a_mistaken_name_or_option_is_shown(run: Run, plant: Path, words: list[str], sentence: str) -> None:
     status, out, err = run("read", plant, *words)
     assert (status, out) == (2, "")
     assert err.startswith(f"multidrop: {sentence.replace('PLANT', str(plant))}")
@@ -140,9 +138,7 @@ def test_read_reports_mistakes_in_a_plant_file_like_the_command_plan(run: Run, p
     assert run("read", plant.with_name("none.toml"), "fan-1")[0] == 2
 
 
-def test_write_accepts_a_plant_file_and_a_drive_name(
-    run: Run, plant: Path, at: str, toy: SimulatedDrive
-) -> None:
+def test_write_accepts_plant_file_and_drive_name(run: Run, plant: Path, at: str, toy: SimulatedDrive) -> None:
     words = ("write", plant, "pump-1", at, "frequency")
     assert run(*words, "25", "--yes") == (0, "pump-1: frequency = 25.00 Hz: done (cannot be read back)\n", "")
     assert toy["frequency"] == 25
@@ -157,9 +153,7 @@ def test_write_accepts_a_plant_file_and_a_drive_name(
 # ---- commands to motors ----
 
 
-def test_verbs_accept_a_plant_file_and_a_drive_name(
-    run: Run, plant: Path, at: str, toy: SimulatedDrive
-) -> None:
+def test_verbs_accept_plant_file_and_drive_name(run: Run, plant: Path, at: str, toy: SimulatedDrive) -> None:
     drive = (plant, "pump-1", at)
     assert run("state", *drive)[1].startswith("stopped\n")
     assert run("set-frequency", *drive, "33.5", "--yes")[0] == 0
@@ -174,9 +168,7 @@ def test_verbs_accept_a_plant_file_and_a_drive_name(
     assert toy["control"] == 0
 
 
-def test_a_stop_finds_its_drive_by_another_spelling_and_a_start_does_not(
-    run: Run, tmp_path: Path, port: str, toy: SimulatedDrive
-) -> None:
+def test_only_stops_accept_other_spellings(run: Run, tmp_path: Path, port: str, toy: SimulatedDrive) -> None:
     """Depending on the keyboard, a u with two dots is one character (U+00FC) or two (U+0075 U+0308)."""
     plant = tmp_path / "spelt.toml"
     text = LINE.format("hall-1", port) + DRIVE.format("L\u00fcfter", TOY, 1)
@@ -194,9 +186,7 @@ def test_a_stop_finds_its_drive_by_another_spelling_and_a_start_does_not(
     assert run("read", *fan, "output_current")[0] == 0
 
 
-def test_a_start_by_plant_file_needs_confirmation(
-    run: Run, plant: Path, at: str, toy: SimulatedDrive
-) -> None:
+def test_a_start_by_plant_file_is_confirmed(run: Run, plant: Path, at: str, toy: SimulatedDrive) -> None:
     status, _, err = run("start", plant, "pump-1", at)
     assert (status, err.startswith("multidrop: Start the motor of pump-1 on /dev/pts/")) == (1, True)
     assert not toy.counters.writes
@@ -256,9 +246,7 @@ def test_poll_replaces_ports_by_the_port_option(run: Run, port: str, tmp_path: P
     assert (status, json.loads(out)["samples"] > 0) == (0, True)
 
 
-def test_monitor_replaces_ports_by_the_port_option(
-    run: Run, plant: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_monitor_accepts_the_port_option(run: Run, plant: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shown: list[str] = []
 
     def watch(watched: Plant, **_: object) -> dict[str, int]:
@@ -389,9 +377,7 @@ def test_stop_of_a_plant_or_line_stops_all_its_drives(
     assert status == has_portless_line
 
 
-def test_a_stop_of_a_plant_prints_json_and_returns_0_if_all_have_stopped(
-    run: Run, tmp_path: Path, port: str, toy: SimulatedDrive
-) -> None:
+def test_a_stop_of_a_plant_prints_json(run: Run, tmp_path: Path, port: str, toy: SimulatedDrive) -> None:
     plant = tmp_path / "all.toml"
     drives = DRIVE.format("pump-1", TOY, 1) + DRIVE.format("pump-4", TOY, 4)
     plant.write_text(LINE.format("hall-1", port) + drives)

@@ -44,9 +44,7 @@ with simulator(Path(sys.argv[1]), Path(sys.argv[2])):
 """
 
 
-def test_poll_requests_realtime_scheduling_by_option_or_by_plant_file(
-    run: Run, plant: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_poll_can_request_realtime_scheduling(run: Run, plant: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[bool] = []
     monkeypatch.setattr("multidrop.core.port._Engine.set_realtime", lambda *words: asked.append(words[-1]))
     run("poll", plant, "--seconds", 0.01, "--json")
@@ -106,9 +104,7 @@ def test_simulate_applies_the_faults_of_its_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_poll_records_in_segments_and_continues_after_a_restart(
-    run: Run, plant: Path, tmp_path: Path
-) -> None:
+def test_poll_records_segments_and_continues_after_a_restart(run: Run, plant: Path, tmp_path: Path) -> None:
     counted = 0
     words = ["--out", tmp_path / "run.arrows", "--rotate", "1 s"]
     for _ in range(2):  # the second run continues the recording
@@ -145,9 +141,7 @@ def test_a_recording_in_segments_must_be_named_by_a_segment(run: Run, tmp_path: 
         (["--most", "big"], "invalid size 'big': write 1 kB or more"),
     ],
 )
-def test_invalid_options_for_segments_are_reported_in_one_sentence(
-    run: Run, plant: Path, words: list[str], sentence: str
-) -> None:
+def test_invalid_segment_options_are_named(run: Run, plant: Path, words: list[str], sentence: str) -> None:
     status, out, told = run("poll", plant, *words)
     assert (status, out) == (2, "")
     assert sentence in told

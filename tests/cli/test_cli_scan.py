@@ -158,9 +158,7 @@ def test_unit_ids_beyond_a_serial_line_s_addresses_are_scanned_on_tcp(run: Run, 
         (("--model", "inovert-ibd"), "did you mean innovert-ibd"),
     ],
 )
-def test_mistaken_scan_arguments_are_reported_in_one_sentence(
-    run: Run, words: tuple[str, ...], sentence: str
-) -> None:
+def test_a_mistaken_scan_argument_is_named(run: Run, words: tuple[str, ...], sentence: str) -> None:
     status, out, err = run("scan", "/dev/nowhere", *words)
     assert (status, out) == (2, "")
     assert sentence in err
@@ -261,9 +259,7 @@ def test_the_plant_file_of_a_scan_has_the_port_name_with_the_adapters_serial_num
     assert load_plant(plant).lines[0].port == str(by_id)
 
 
-def test_an_interrupted_scan_without_findings_gives_no_advice(
-    run: Run, port: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupted_scan_gives_no_advice(run: Run, port: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(*_: object) -> Iterator[Finding]:
         raise KeyboardInterrupt
 
@@ -273,9 +269,7 @@ def test_an_interrupted_scan_without_findings_gives_no_advice(
     assert re.fullmatch(r"no drives found in \d+ s\n", out)
 
 
-def test_the_option_quick_skips_the_second_pass_of_a_scan(
-    run: Run, port: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_quick_skips_the_second_pass_of_a_scan(run: Run, port: str, monkeypatch: pytest.MonkeyPatch) -> None:
     planned: list[list[Sweep]] = []
 
     def noted(_: object, sweeps: Sequence[Sweep], *__: object) -> Iterator[Finding]:
@@ -354,9 +348,7 @@ def devices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "dev"
 
 
-def test_ports_lists_existing_ports_with_adapter_and_driver(
-    devices: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_ports_lists_ports_with_adapter_and_driver(devices: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["ports"]) == 0
     assert capsys.readouterr().out == (
         f"{devices}/ttyUSB0\n  FTDI R (0403:6001); driver ftdi_sio\n  you may open it\n"
@@ -373,9 +365,7 @@ def test_ports_advises_to_plug_in_an_adapter_if_there_is_no_port(
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="permissions of POSIX")
-def test_ports_names_the_group_whose_members_may_open_a_port(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ports_names_the_group_that_may_open_a_port(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import grp
     import pwd
 
@@ -390,9 +380,7 @@ def test_ports_names_the_group_whose_members_may_open_a_port(
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="permissions of POSIX")
-def test_advice_for_a_port_is_given_in_a_container_whose_user_has_no_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_port_advice_works_without_a_user_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     port = tmp_path / "ttyUSB0"
     port.touch(mode=0o660)
     monkeypatch.setattr(os, "getuid", lambda: 4_123_456)

@@ -76,9 +76,7 @@ def plant(directory: Path, port: str) -> Path:
 
 
 @pytest.mark.long
-def test_polled_values_are_sniffed_captured_and_decoded(
-    line: tuple[str, str], tmp_path: Path, run: Run
-) -> None:
+def test_polled_values_can_be_sniffed_and_decoded(line: tuple[str, str], tmp_path: Path, run: Run) -> None:
     port, tap = line
     file = plant(tmp_path, port)
     with sniffing(tap, "--plant", file, "--out", tmp_path / "a.pcapng") as sniffer:
@@ -249,9 +247,7 @@ def delixi_plant(directory: Path) -> Path:
 
 
 @pytest.mark.parametrize("command", [["decode"], ["sniff", "--replay"]])
-def test_decode_prints_the_values_of_a_capture_with_units(
-    run: Run, capture: Path, command: list[str]
-) -> None:
+def test_decode_prints_values_of_a_capture_with_units(run: Run, capture: Path, command: list[str]) -> None:
     status, out, err = run(*command, capture, "--plant", delixi_plant(capture.parent))
     assert (status, err) == (0, "")
     assert [line.partition("  ")[2] for line in out.splitlines()[:4]] == [

@@ -173,9 +173,7 @@ def test_a_stop_continues_after_its_terminal_was_closed(run: Run, che: Che, verb
         (["pump-2"], ["stop takes one drive, which is invt-che@1: ignored pump-2"]),
     ],
 )
-def test_a_mistake_after_the_drives_name_does_not_prevent_a_stop(
-    run: Run, che: Che, mistake: list[str], told: list[str]
-) -> None:
+def test_a_mistaken_option_prevents_no_stop(run: Run, che: Che, mistake: list[str], told: list[str]) -> None:
     received, words = che
     assert run("start", *words, "--frequency", 20, "--yes")[0] == 0
     begun = len(received.writes)
@@ -204,9 +202,7 @@ def test_the_value_of_an_unknown_option_is_not_taken_for_a_drive(run: Run, che: 
 
 
 @patient
-def test_a_stop_is_sent_even_if_its_terminal_closes_while_it_starts(
-    run: Run, che: Che, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stop_is_sent_if_its_terminal_closes(run: Run, che: Che, monkeypatch: pytest.MonkeyPatch) -> None:
     """The terminal closes before the arguments are parsed, which takes a while on a small computer."""
 
     def parse(*words: Any) -> Any:
@@ -247,9 +243,7 @@ def plant_of(port: object, folder: Path) -> Path:
 @pytest.mark.long
 @patient
 @pytest.mark.parametrize("keys", usually(b"sy", b"Sy"))
-def test_a_stop_from_the_monitor_continues_after_its_terminal_was_closed(
-    run: Run, che: Che, tmp_path: Path, keys: bytes
-) -> None:
+def test_a_monitors_stop_outlives_its_terminal(run: Run, che: Che, tmp_path: Path, keys: bytes) -> None:
     received, words = che
     assert run("start", *words, "--frequency", 20, "--yes")[0] == 0
     begun = len(received.writes)

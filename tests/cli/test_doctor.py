@@ -226,9 +226,7 @@ def responder() -> Iterator[Callable[[Callable[[bytes], bytes]], Responder]]:
 
 
 @pytest.mark.slow
-def test_an_exception_reply_in_the_echo_test_is_not_called_foreign_traffic(
-    run: Run, responder: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_echo_test_ignores_exceptions(run: Run, responder: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """A server may answer for every address, even an unused one."""
     # on a busy machine, the reply may come late
     monkeypatch.setattr("multidrop.cli.doctor.LEAST_TIMEOUT", 2.0)
@@ -240,9 +238,7 @@ def test_an_exception_reply_in_the_echo_test_is_not_called_foreign_traffic(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("code", [0x0A, 0x0B])
-def test_a_gateways_exception_does_not_count_as_the_drives_answer(
-    run: Run, responder: Any, code: int
-) -> None:
+def test_a_gateways_exception_is_not_the_drives_answer(run: Run, responder: Any, code: int) -> None:
     """These codes mean that the device was not reached (application protocol V1.1b3, section 7)."""
     end = responder(lambda request: build_reply(Framing.RTU, Message(request[0], request[1], exception=code)))
     status, told = examined(run, end.path, *CHE_9)
@@ -251,9 +247,7 @@ def test_a_gateways_exception_does_not_count_as_the_drives_answer(
 
 
 @pytest.mark.slow
-def test_a_gateways_exception_proves_its_framing_but_noise_does_not(
-    run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_gateways_exception_proves_its_framing(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """Bytes without a frame do not prove that the far end speaks the other framing."""
     monkeypatch.setattr(doctor, "MOST_S", 1.0)
     monkeypatch.setattr(doctor.ask_once, "__defaults__", (RS485.OFF, 0.5))
@@ -284,9 +278,7 @@ def test_doctor_prints_the_exception_code_of_a_drive_that_refuses(run: Run, resp
 
 
 @pytest.mark.slow
-def test_doctor_counts_only_requests_that_were_sent(
-    run: Run, responder: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_doctor_counts_only_sent_requests(run: Run, responder: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """A silent drive gets no request while its late reply may come. Held-back requests are not counted."""
     end = responder(lambda request: b"")
     monkeypatch.setattr("multidrop.cli.doctor.MOST_S", 1.0)
@@ -309,9 +301,7 @@ def test_doctor_counts_only_requests_that_were_sent(
         (("/dev/nowhere", "--framing", "rtu"), 2, "--framing needs a drive: add --model and --address"),
     ],
 )
-def test_mistaken_doctor_arguments_are_reported_in_one_sentence(
-    run: Run, words: tuple[str, ...], status: int, sentence: str
-) -> None:
+def test_mistaken_arguments_are_named(run: Run, words: tuple[str, ...], status: int, sentence: str) -> None:
     found, out, err = run("doctor", *words)
     assert (found, out) == (status, "")
     assert sentence in err
@@ -340,9 +330,7 @@ def test_a_drive_on_modbus_tcp_is_measured(port: str, run: Run) -> None:
     ),
     indirect=["port"],
 )
-def test_doctor_reports_a_far_end_with_the_other_framing(
-    port: str, asked: str, spoken: str, other: str, run: Run
-) -> None:
+def test_doctor_reports_the_other_framing(port: str, asked: str, spoken: str, other: str, run: Run) -> None:
     place = port.partition("://")[2]
     status, told = examined(run, f"{asked}://{place}", *CHE_1)
     assert status == 1
@@ -351,9 +339,7 @@ def test_doctor_reports_a_far_end_with_the_other_framing(
 
 
 @pytest.mark.parametrize("table_of", ["setting", "command"], ids=["readable", "unreadable"])
-def test_a_family_without_readings_is_measured_by_any_readable_register(
-    run: Run, tmp_path: Path, table_of: str
-) -> None:
+def test_any_register_measures_a_family_without_readings(run: Run, tmp_path: Path, table_of: str) -> None:
     family = tmp_path / "relay.toml"
     family.write_text(
         '[family]\ntitle = "Relay board"\nmanual = "x"\ncounts_from = 0\n[default]\ntable = "coil"\n'

@@ -227,9 +227,7 @@ def test_doctor_gives_advice_if_the_latency_timer_is_long(sysfs: Path) -> None:
         ),
     ],
 )
-def test_each_finding_is_a_sentence_with_advice_only_if_needed(
-    finding: object, what: str, advised: bool
-) -> None:
+def test_each_finding_is_a_sentence_with_advice_if_needed(finding: object, what: str, advised: bool) -> None:
     assert finding.what == what
     assert bool(finding.advice) == advised
 

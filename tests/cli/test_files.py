@@ -58,9 +58,7 @@ class PollerOf:
         pass
 
 
-def test_error_of_a_full_disk_states_the_number_of_readable_rows(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_error_states_the_readable_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The second batch does not fit on the disk. The third would fit, but must not follow missing rows."""
     monkeypatch.setattr(PollerOf, "batches", (counting(20), counting(2000), counting(5)))
     monkeypatch.setattr(polling, "Poller", PollerOf)

@@ -102,9 +102,7 @@ def test_terminal_shows_the_signal_around_the_last_trigger(plant: Path, tmp_path
         terminal.wait_for("1 trigger recorded")
 
 
-def test_the_picture_of_a_trigger_shows_its_signals_and_its_moment(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_picture_of_a_trigger_shows_its_moment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     about = {"condition": "a.i > 3", "time_ns": 2 * 10**9, "pre_s": 1.0, "post_s": 3.0}
     registers = {"i": {"unit": "A"}, "u": {"unit": "V"}}
     rows = [Row(at * 10**8, at, 0, "a", name, float(at == 25), "ok") for at in range(10, 40) for name in "iu"]

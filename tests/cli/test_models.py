@@ -107,9 +107,7 @@ def test_a_model_file_that_is_a_link_to_another_type_is_reported(tmp_path: Path)
         ),
     ],
 )
-def test_error_in_a_model_file_is_one_sentence_that_names_the_line(
-    tmp_path: Path, source: str, ending: str
-) -> None:
+def test_a_model_file_error_is_one_sentence_with_the_line(tmp_path: Path, source: str, ending: str) -> None:
     (tmp_path / "broken.py").write_text(source)
     sentence = refused("broken.py:Fan", tmp_path)
     assert sentence.startswith(str(tmp_path / "broken.py"))
@@ -183,9 +181,7 @@ def test_a_user_file_never_replaces_a_module_of_python_or_multidrop(tmp_path: Pa
     assert sys.modules[name] in [module.OURS for module in loaded]
 
 
-def test_modules_that_the_program_imported_are_reused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_already_imported_modules_are_reused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     directory = with_scales(tmp_path / "plant", 0.1)
     monkeypatch.syspath_prepend(str(directory))
     import scales  # type: ignore[import-not-found]
@@ -348,9 +344,7 @@ def test_models_prints_every_register_of_a_family_as_json(run: Run) -> None:
         ),
     ],
 )
-def test_models_prints_settings_of_the_drive_and_limits_of_values(
-    run: Run, name: str, facts: list[str]
-) -> None:
+def test_models_prints_settings_and_limits_of_values(run: Run, name: str, facts: list[str]) -> None:
     """Settings and limits are printed in the words of the manual (ERMAN, section 3; YD1000, 4.3 and 6.1)."""
     _, out, _ = run("models", name)
     shown = " ".join(out.split())

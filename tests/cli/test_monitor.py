@@ -233,9 +233,7 @@ def test_reads_of_unpolled_registers_take_at_most_5_percent_of_a_lines_time(tmp_
 @pytest.mark.long
 @table("size", [(60, 12), (80, 24), (200, 50), (500, 100)])
 @table("drives", [1, 31, 247])
-def test_the_monitors_pictures_fit_every_terminal_size(
-    tmp_path: Path, size: tuple[int, int], drives: int
-) -> None:
+def test_monitor_pictures_fit_every_terminal_size(tmp_path: Path, size: tuple[int, int], drives: int) -> None:
     live = LivePlant(a_plant(tmp_path, min(drives, 247)))
     live.add(from_rows([row("drive-1", register, 4.0) for register in CHE]))
     live.tick(1.0, told(1, 1, 1.0, drives))
@@ -420,9 +418,7 @@ def test_the_monitor_sends_a_stop_only_after_a_yes(screened: Screened) -> None:
         assert screened.poller.asked == asked
 
 
-def test_the_monitor_sends_a_stop_even_if_no_thread_can_start(
-    screened: Screened, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_monitor_can_stop_without_a_thread(screened: Screened, monkeypatch: pytest.MonkeyPatch) -> None:
     monitor, poller = screened
 
     def none(thread: object) -> None:
@@ -521,9 +517,7 @@ def test_the_monitor_shows_any_exception_of_a_stop_as_a_failure(
     assert f"stopping drive-1 failed: {words}" in screened.text
 
 
-def test_a_failed_stop_is_not_shown_as_being_repeated(
-    screened: Screened, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_stop_is_not_shown_as_repeated(screened: Screened, monkeypatch: pytest.MonkeyPatch) -> None:
     monitor, poller = screened
 
     def fail(*details: object) -> None:
@@ -535,9 +529,7 @@ def test_a_failed_stop_is_not_shown_as_being_repeated(
     assert monitor._at.message == "stopping drive-1 failed"
 
 
-def test_quitting_during_a_stop_asks_and_then_waits_for_it(
-    screened: Screened, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_quitting_waits_for_a_running_stop(screened: Screened, capsys: pytest.CaptureFixture[str]) -> None:
     monitor = screened.monitor
     stands = threading.Event()
     del monitor._begin  # restores the real method, which starts a thread

@@ -44,9 +44,7 @@ def edited(path: str, before: str, after: str) -> None:
     Path(path).write_text(text.replace(before, after))
 
 
-def test_saved_parameters_are_compared_and_applied(
-    run: Run, drive: tuple[object, ...], sim: MotorDrive
-) -> None:
+def test_saved_parameters_can_be_compared(run: Run, drive: tuple[object, ...], sim: MotorDrive) -> None:
     assert run("params", "save", *drive, "pump.toml")[0] == 0
     assert run("params", "diff", "pump.toml", *drive)[0] == 0
     sim["acceleration_time"] = 25.0
@@ -70,9 +68,7 @@ def test_apply_writes_only_after_confirmation(run: Run, drive: tuple[object, ...
     assert "Write 1 parameter to" in err
 
 
-def test_a_refused_second_write_names_the_option_that_permits_it(
-    run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_a_second_write_needs_an_option(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     # shorter, because with the manual's silences the test would take 2 s
@@ -91,9 +87,7 @@ def test_a_refused_second_write_names_the_option_that_permits_it(
 
 
 @pytest.mark.slow
-def test_commissioning_needs_a_terminal_for_confirmation(
-    run: Run, drive: tuple[object, ...], sim: MotorDrive
-) -> None:
+def test_commissioning_needs_a_terminal(run: Run, drive: tuple[object, ...], sim: MotorDrive) -> None:
     run("params", "save", *drive, "pump.toml")
     sim["acceleration_time"] = 25.0
     words = ("params", "apply", "pump.toml", *drive, "--yes", "--commissioning", "--audit", "audit.jsonl")
@@ -112,9 +106,7 @@ def test_commissioning_needs_a_terminal_for_confirmation(
     assert json.loads(Path("audit.jsonl").read_text())["commissioning"] is True
 
 
-def test_apply_writes_nothing_while_the_motor_runs(
-    run: Run, drive: tuple[object, ...], sim: MotorDrive
-) -> None:
+def test_apply_refuses_to_write_while_it_runs(run: Run, drive: tuple[object, ...], sim: MotorDrive) -> None:
     run("params", "save", *drive, "pump.toml")
     sim["acceleration_time"] = 25.0
     sim.motor.target = 40.0
@@ -211,9 +203,7 @@ aborts: fan.output_current > 30; no value for 5 s; a failed command
     assert (status, [step["at_s"] for step in json.loads(out)["steps"]]) == (0, [0.0, 0.0, 2.0])
 
 
-def test_a_test_run_whose_steps_are_too_short_is_refused_before_a_port_opens(
-    run: Run, tmp_path: Path
-) -> None:
+def test_a_test_run_with_too_short_steps_is_refused_before_a_port_opens(run: Run, tmp_path: Path) -> None:
     path = write_test(tmp_path, STEPS.replace('"2 s"', '"50 ms"'))
     status, out, _ = run("run", path, "--dry-run")
     assert status == 1

@@ -86,9 +86,7 @@ def test_a_history_s_folder_as_argument_prints_one_sentence(run: Run, tmp_path: 
 
 
 @pytest.mark.parametrize("command", ["plot", "report"])
-def test_a_file_without_rows_or_not_a_recording_prints_one_sentence(
-    run: Run, tmp_path: Path, command: str
-) -> None:
+def test_a_file_without_a_recording_prints_one_sentence(run: Run, tmp_path: Path, command: str) -> None:
     assert run(command, ".")[::2] == (2, "multidrop: . is a folder: name the recording in it\n")
     text = tmp_path / "letter.arrows"
     text.write_text("Dear Sir")
@@ -105,9 +103,7 @@ def test_a_file_without_rows_or_not_a_recording_prints_one_sentence(
 
 
 @pytest.mark.parametrize("time", [-(2**63), -1, 2**63 - 1])
-def test_recordings_with_times_outside_the_calendar_print_one_sentence(
-    run: Run, tmp_path: Path, time: int
-) -> None:
+def test_times_outside_the_calendar_print_one_sentence(run: Run, tmp_path: Path, time: int) -> None:
     rows = [
         row(0, "pump", "output_frequency", 1.0),
         row(1, "pump", "output_frequency", 1.0)._replace(time_ns=time),

@@ -470,10 +470,7 @@ def test_schema_checks_registers_and_integrals_of_channels(channel: str, is_acce
     [("plant", valid_plants, invalid_plants), ("family", valid_families, invalid_families)],
 )
 def test_the_toml_checker_taplo_refuses_the_same_files(
-    tmp_path: Path,
-    kind: str,
-    valid: Callable[[], list[str]],
-    invalid: Callable[[], list[str]],
+    tmp_path: Path, kind: str, valid: Callable[[], list[str]], invalid: Callable[[], list[str]]
 ) -> None:
     """Check files with taplo, as editors do; taplo supports fewer regular expressions than our checker."""
     taplo = require_program("taplo")

@@ -229,9 +229,7 @@ except:
 """
 
 
-def test_ctrl_c_ends_a_conversion_although_its_library_catches_it(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ctrl_c_ends_a_conversion(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "asammdf.py").write_text(CARELESS)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setitem(sys.modules, "asammdf", None)

@@ -375,8 +375,6 @@ def test_digits_other_than_ascii_are_refused_in_requests_and_files(text: str) ->
         ["doctor", "/dev/none", "--address", "{}"],
     ],
 )
-def test_a_command_with_digits_other_than_ascii_returns_2(
-    words: list[str], text: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_only_ascii_digits_are_valid(words: list[str], text: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([word.format(text) for word in words]) == 2
     assert "no such" not in capsys.readouterr().err.lower()  # neither a port nor a file was opened

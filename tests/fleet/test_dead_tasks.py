@@ -132,9 +132,7 @@ def test_a_gateway_runs_exactly_the_listed_tasks_and_threads(gateway: Any) -> No
 @pytest.mark.parametrize(
     "name", [pytest.param(one, marks=[] if one in TRIED else pytest.mark.slow) for one in TASKS]
 )
-def test_a_task_that_is_killed_is_logged_and_ends_the_gateway(
-    gateway: Any, name: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_killed_task_ends_the_gateway(gateway: Any, name: str, caplog: pytest.LogCaptureFixture) -> None:
     async def kill(made: FleetGateway) -> None:
         task = supervisor().kept[name]
         while not task.done():  # Python 3.11's wait_for may swallow one cancellation
@@ -159,9 +157,7 @@ def test_the_exception_that_ended_a_task_is_logged_with_its_cause(
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_the_gateway_shuts_down_if_the_spools_thread_has_ended(
-    gateway: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_gateway_ends_with_its_spools_thread(gateway: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     def leave() -> bool:
         raise SystemExit
 
@@ -182,9 +178,7 @@ def test_the_gateway_shuts_down_if_polling_has_failed(gateway: Any) -> None:
         gateway(kill)
 
 
-def test_the_gateway_shuts_down_if_it_cannot_subscribe_to_commands(
-    gateway: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_gateway_ends_if_it_cannot_get_commands(gateway: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """A gateway without the subscription would miss stops."""
 
     async def kill(made: FleetGateway) -> None:
@@ -195,9 +189,7 @@ def test_the_gateway_shuts_down_if_it_cannot_subscribe_to_commands(
         gateway(kill)
 
 
-async def test_a_client_for_commands_reports_the_end_of_its_connection(
-    fleet: Cluster, tmp_path: Path
-) -> None:
+async def test_a_command_client_reports_the_end_of_its_connection(fleet: Cluster, tmp_path: Path) -> None:
     """A commander is a client for commands. The page replaces one whose connection has ended."""
     async with FleetCommands(fleet.urls, by="page", log=tmp_path / "log.jsonl") as commands:
         commands._keeping[1].cancel()
@@ -281,9 +273,7 @@ def test_an_error_while_metrics_are_computed_gives_status_500(caplog: pytest.Log
     assert "Ill: a mistake" in caplog.text
 
 
-def test_a_sender_gets_an_answer_if_its_stop_raises_in_the_gateway(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stop_that_raises_is_answered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with desks(tmp_path) as desk:
         monkeypatch.setattr(desk.stops._repeated, "begin", lambda *details: asyncio.run(fail()))
         answer = asyncio.run(desk.stop())
@@ -359,9 +349,7 @@ async def test_a_line_can_be_closed_after_polling_has_failed(taken: Taken) -> No
 
 
 @pytest.mark.long
-def test_fleet_status_counts_lines_on_which_polling_fails(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_fleet_status_counts_lines_without_polling(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     failures = {"hall": "Ill: of its class"}
     monkeypatch.setattr(Poller, "line_failures", property(lambda poller: failures))
 

@@ -69,9 +69,7 @@ def _own_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ["write", "pump-1", "frequency", "20", "--yes"],
     ),
 )
-def test_a_server_that_cannot_be_reached_is_reported_in_one_sentence(
-    run: Run, nobody: str, words: list[str]
-) -> None:
+def test_an_unreachable_server_is_reported_in_one_sentence(run: Run, nobody: str, words: list[str]) -> None:
     said = one_sentence(run("fleet", *words, "--nats", nobody))
     assert f"no NATS server answers at {nobody}: Connection refused" in said
 
@@ -119,9 +117,7 @@ MISTAKES: dict[str, tuple[Callable[[Path], Path], str]] = {
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_init_refuses_a_plant_file_with_a_mistake(
-    run: Run, nobody: str, tmp_path: Path, mistake: str
-) -> None:
+def test_init_refuses_an_invalid_plant_file(run: Run, nobody: str, tmp_path: Path, mistake: str) -> None:
     make, sentence = MISTAKES[mistake]
     assert sentence in one_sentence(run("fleet", "init", make(tmp_path), "--nats", nobody))
 
@@ -183,9 +179,7 @@ def test_mistakes_in_permission_lists_are_reported(run: Run, nobody: str, tmp_pa
         (["reset-fault", "pump-1", "--by", "\x1b[31m"], "is not 1 to 200 printable characters"),
     ],
 )
-def test_each_mistake_on_the_command_line_is_reported_in_one_sentence(
-    run: Run, words: list[str], sentence: str
-) -> None:
+def test_each_command_line_mistake_is_one_sentence(run: Run, words: list[str], sentence: str) -> None:
     assert sentence in one_sentence(run("fleet", *words))
 
 
@@ -203,9 +197,7 @@ def test_a_stop_with_an_unknown_option_is_still_sent(run: Run, nobody: str, acti
 
 
 @pytest.mark.parametrize("library", ["nats", "pyarrow"])
-def test_a_missing_optional_package_is_reported_in_one_sentence(
-    run: Run, monkeypatch: pytest.MonkeyPatch, library: str
-) -> None:
+def test_a_missing_package_is_reported(run: Run, monkeypatch: pytest.MonkeyPatch, library: str) -> None:
     found = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == library else found(name))
     said = one_sentence(run("fleet", "status"))
@@ -215,9 +207,7 @@ def test_a_missing_optional_package_is_reported_in_one_sentence(
     )
 
 
-def test_a_second_gateway_of_the_same_name_in_one_folder_is_refused(
-    run: Run, tmp_path: Path, nobody: str
-) -> None:
+def test_a_second_gateway_of_the_same_name_is_refused(run: Run, tmp_path: Path, nobody: str) -> None:
     from multidrop.fleet.leases.lease import LifeLock
 
     with closing(LifeLock(tmp_path / "gw-1.lock")):
@@ -307,18 +297,14 @@ def test_the_demo_plant_has_two_drives_on_each_line(tmp_path: Path) -> None:
     ("said", "version"),
     [("nats-server: v2.15.1", (2, 15)), ("nats-server: v2.9.10", (2, 9)), ("no idea", (0, 0))],
 )
-def test_the_version_of_a_nats_server_program_is_parsed(
-    tmp_path: Path, said: str, version: tuple[int, int]
-) -> None:
+def test_a_nats_server_version_is_parsed(tmp_path: Path, said: str, version: tuple[int, int]) -> None:
     program = tmp_path / "nats-server"
     program.write_text(f"#!/bin/sh\necho '{said}'\n")
     program.chmod(0o755)
     assert demo.version_of(str(program)) == version
 
 
-def test_without_a_nats_server_the_error_says_where_to_get_one(
-    run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_nats_server_the_error_says_where_it_is(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(demo, "_programs", lambda: iter(["/nowhere/nats-server"]))
     status, out, err = run("fleet", "demo")
     assert (status, out) == (2, "")
@@ -377,9 +363,7 @@ def test_the_demo_shows_a_takeover() -> None:
 @pytest.mark.slow
 @pytest.mark.long
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 130), (signal.SIGKILL, -signal.SIGKILL)])
-def test_the_demo_removes_its_processes_and_files_when_it_is_killed(
-    number: signal.Signals, status: int
-) -> None:
+def test_a_killed_demo_leaves_no_process_or_file(number: signal.Signals, status: int) -> None:
     with started() as (demo, folder):
         demo.send_signal(number)
         assert demo.wait(60) == status

@@ -114,9 +114,7 @@ async def test_the_remaining_time_of_a_gateway_without_a_lease_is_zero(tmp_path:
     await gateway._close()
 
 
-async def test_the_kernels_timer_is_cancelled_after_the_lines_are_closed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_closing_lines_cancels_their_timer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The poller may run until its lines are closed.
 
     If the timer stayed set, it would later kill the process.
@@ -189,9 +187,7 @@ def test_each_mistake_in_the_fleet_table_is_reported(tmp_path: Path, table: str,
     assert sentence in str(raised.value)
 
 
-def test_fleet_settings_name_the_missing_nats_library(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_nats_library_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in [name for name in sys.modules if name.split(".")[0] == "nats"]:
         monkeypatch.setitem(sys.modules, name, None)
     for name in [name for name in sys.modules if name.startswith("multidrop.fleet")]:
@@ -201,9 +197,7 @@ def test_fleet_settings_name_the_missing_nats_library(
 
 
 @pytest.mark.parametrize("dying", ["path", "watch", "commander", "path of samples", "rows", "lines"])
-def test_the_part_fleet_ends_if_any_of_its_tasks_fails(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, dying: str
-) -> None:
+def test_a_failed_task_ends_the_fleet(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, dying: str) -> None:
     """The gateway reports a part that has ended.
 
     Otherwise the page would show an old view of the fleet forever.

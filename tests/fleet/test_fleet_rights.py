@@ -271,9 +271,7 @@ def test_rights_without_tls_cause_a_warning(run: Run, tmp_path: Path) -> None:
         (["gw-1", "--nats", "nats://a:port"], "nats://a:port is not an address of a NATS server"),
     ],
 )
-def test_fleet_rights_with_invalid_arguments_writes_no_file(
-    run: Run, tmp_path: Path, words: list[str], sentence: str
-) -> None:
+def test_invalid_arguments_write_no_file(run: Run, tmp_path: Path, words: list[str], sentence: str) -> None:
     status, out, err = run("fleet", "rights", *words, "--folder", tmp_path / "nats")
     assert (status, out) == (2, "")
     [line] = err.splitlines()

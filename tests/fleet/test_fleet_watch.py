@@ -229,9 +229,7 @@ class FailingView:
         return {"gateways": {}, "lines": {}, "moves": []}
 
 
-async def test_after_a_failed_read_the_last_view_is_shown_with_its_age(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+async def test_a_failed_read_shows_the_last_view_with_its_age(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(views, "EVERY_S", 0.02)
     shown: list[dict[str, Any]] = []
     over = asyncio.Event()

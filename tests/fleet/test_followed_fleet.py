@@ -81,9 +81,7 @@ def test_samples_of_unknown_drives_are_ignored_and_not_remembered() -> None:
     assert not reader._newest
 
 
-def test_a_sample_with_status_ok_but_no_value_is_shown_as_no_valid_value(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_an_ok_sample_without_value_is_shown_as_no_valid_value(monkeypatch: pytest.MonkeyPatch) -> None:
     table = unpack(message(0).data)
     at = table.schema.get_field_index("value")
     empty = table.set_column(at, table.schema.field("value"), pa.nulls(len(table), pa.float64()))
@@ -94,9 +92,7 @@ def test_a_sample_with_status_ok_but_no_value_is_shown_as_no_valid_value(
     assert not any(columns.valid)
 
 
-def test_a_gateway_that_sends_endless_names_and_statuses_is_tolerated(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_gateway_with_endless_names_and_statuses_is_tolerated(monkeypatch: pytest.MonkeyPatch) -> None:
     array("H", [followed.MOST_NAMES, followed.MOST_STATUSES])  # raises OverflowError above 16 bits
     monkeypatch.setattr(followed, "MOST_NAMES", 5)
     monkeypatch.setattr(followed, "MOST_STATUSES", 3)
@@ -241,9 +237,7 @@ def test_only_multidrop_serve_with_a_fleet_accepts_a_plant_without_lines(tmp_pat
         ('[serve.may]\nverbs = ["a.start"]', "[serve.may] lists need lines in this plant file; [fleet.may]"),
     ],
 )
-def test_a_plant_file_without_lines_cannot_have_parts_that_need_lines(
-    tmp_path: Path, more: str, sentence: str
-) -> None:
+def test_a_plant_without_lines_has_no_parts_of_lines(tmp_path: Path, more: str, sentence: str) -> None:
     path = tmp_path / "page.toml"
     path.write_text(f"{SERVERS}{more}\n")
     with pytest.raises(PlantError) as raised:

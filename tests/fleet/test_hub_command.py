@@ -145,7 +145,7 @@ def refused(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str]:
 
 
 @pytest.mark.slow
-def test_a_server_that_cannot_be_reached_is_reported_in_one_sentence(
+def test_an_unreachable_server_is_reported_in_one_sentence(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     url = f"nats://127.0.0.1:{free_ports(1)[0]}"
@@ -190,18 +190,14 @@ def test_the_hub_requires_either_a_folder_or_a_database(capsys: pytest.CaptureFi
     assert "not allowed with argument" in told
 
 
-def test_missing_credentials_are_reported_in_one_sentence(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_missing_credentials_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "nobody.creds"
     told = refused(capsys, "nats://x", "--parquet", str(tmp_path / "hub"), "--credentials", str(path))
     assert told == (2, f"multidrop: {path}: No such file or directory\n")
     assert not (tmp_path / "hub").exists()
 
 
-def test_a_missing_stream_is_reported_in_one_sentence(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_missing_stream_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with cluster(tmp_path / "nats", 1) as one:
         status, told = refused(capsys, one.urls[0], "--parquet", str(tmp_path / "hub"), "--once")
     assert status == 1
@@ -328,9 +324,7 @@ def test_compaction_interrupted_before_any_step_loses_no_row(
 
 
 @pytest.mark.long
-def test_reading_files_while_they_are_merged_fails_or_gives_every_row_once(
-    sink: ParquetSink, tmp_path: Path
-) -> None:
+def test_reading_files_during_a_merge_fails_or_gives_all_rows_once(sink: ParquetSink, tmp_path: Path) -> None:
     write(sink, range(FILES))
     told = []
     for at in (0, 1, 5):
@@ -423,9 +417,7 @@ def test_a_full_stream_of_samples_leaves_disk_space_for_records(run: Run, tmp_pa
 @pytest.mark.usefixtures("_small_servers")
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [1, pytest.param(3, marks=pytest.mark.long)])
-def test_servers_with_too_little_disk_space_are_reported_in_one_sentence(
-    run: Run, tmp_path: Path, number: int
-) -> None:
+def test_servers_with_too_little_disk_space_are_reported(run: Run, tmp_path: Path, number: int) -> None:
     with cluster(tmp_path / "nats", number) as small:
         status, out, err = run("fleet", "init", "--nats", ",".join(small.urls))
     assert (status, out, err.count("\n")) == (1, "", 1)

@@ -240,9 +240,7 @@ def read(session: Session, bucket: int, record: Stored) -> Session:
 
 @pytest.mark.long
 @table("sessions, most, least", [("ab", 4, 50_000), ("abc", 2, 10_000)])
-def test_no_order_of_claims_and_releases_gives_two_masters_or_loses_a_line(
-    sessions: str, most: int, least: int
-) -> None:
+def test_no_order_of_claims_and_releases_gives_two_masters(sessions: str, most: int, least: int) -> None:
     """Two sessions with five records, and three with three records, were also checked: 553,000 states."""
     states, wrong = Model(sessions, most).search()
     assert wrong is None

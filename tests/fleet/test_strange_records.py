@@ -74,18 +74,14 @@ def test_invalid_records_are_rejected(name: str) -> None:
 @table(
     ("bucket", "key", "value"), [("lease_2", "gw-1", LEASE), ("own_0", "l", OWNER), ("plant", "line-1", LINE)]
 )
-def test_a_valid_record_may_have_fields_of_a_newer_version(
-    bucket: str, key: str, value: dict[str, Any]
-) -> None:
+def test_records_may_have_fields_of_a_newer_version(bucket: str, key: str, value: dict[str, Any]) -> None:
     assert parsed(bucket, key, json.dumps(value).encode()) == (value, "")
     more = {**value, "of another version": [1, 2]}
     assert parsed(bucket, key, json.dumps(more).encode()) == (more, "")
     assert parsed(bucket, key, b"") == (None, "")  # empty: the record was removed
 
 
-async def test_an_invalid_record_is_logged_once_and_valid_records_are_read(
-    one: Cluster, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_an_invalid_record_is_logged_once(one: Cluster, caplog: pytest.LogCaptureFixture) -> None:
     async with connected_path(one) as path:
         bucket = Bucket("own_2", lambda: path)
         await path.request("$KV.own_2.bad", b"{}")
@@ -162,9 +158,7 @@ async def test_a_gateway_survives_invalid_records(one: Cluster, monkeypatch: pyt
 
 
 @pytest.mark.long
-async def test_a_sessions_end_written_early_by_another_gateway_counts_after_the_lease(
-    one: Cluster,
-) -> None:
+async def test_a_sessions_end_written_early_by_another_gateway_counts_after_the_lease(one: Cluster) -> None:
     """The gateway's process may hang. Its engine then continues to poll until the lease expires."""
     async with connected_path(one) as path:
         await store(Bucket(names.PLANT, lambda: path), {"line-1": LINE})
@@ -231,9 +225,7 @@ async def test_an_invalid_gateway_state_is_reported(one: Cluster, answer: bytes,
 
 
 @pytest.mark.slow
-async def test_a_request_that_servers_refuse_is_reported_in_one_sentence(
-    one: Cluster, tmp_path: Path
-) -> None:
+async def test_a_refused_request_is_reported_in_one_sentence(one: Cluster, tmp_path: Path) -> None:
     async with connected_path(one) as path:
         with pytest.raises(ServerError, match="NATS refuses: "):
             await Bucket("nothing", lambda: path).get("gw-1")
@@ -317,9 +309,7 @@ async def test_an_invalid_answer_of_a_server_raises_a_fleet_error(name: str) -> 
 
 
 @pytest.mark.parametrize("name", CLUSTERS)
-async def test_an_invalid_state_of_a_cluster_moves_no_bucket_leader(
-    name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_an_invalid_cluster_state_moves_no_leader(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Exceptions would end the gateway's tasks that read the states of clusters."""
     monkeypatch.setattr(setup, "WAIT_S", 0.0)  # the test does not wait for an election
     path: Any = Liar(CLUSTERS[name])

@@ -60,9 +60,7 @@ class UnopenedLines:
     ],
     ids=["a write", "a verb", "a stop", "a stop of all"],
 )
-def test_the_end_time_of_a_drives_latest_command_is_known(
-    command: Callable[[Commands], Awaitable[Any]],
-) -> None:
+def test_the_end_time_of_a_drives_last_command(command: Callable[[Commands], Awaitable[Any]]) -> None:
     commands = Commands(UnopenedLines(), MAY)
     assert commands.ended_ns("mill") == 0
     begun_ns = time.monotonic_ns()
@@ -122,7 +120,7 @@ async def test_a_refused_command_has_no_end_time() -> None:
 
 
 @pytest.mark.parametrize("verb", ["stop", "coast"])
-def test_a_drive_name_in_another_unicode_spelling_works_for_stops_only(verb: str) -> None:
+def test_only_stops_accept_another_unicode_spelling(verb: str) -> None:
     """A u with two dots is one character (U+00FC) on some keyboards, and two (U+0075 U+0308) on others."""
     fan, spelt = "L\u00fcfter", "Lu\u0308fter"
     line, known, _ = one(InvtCHE(1, name=fan, maximum_frequency=50))

@@ -94,9 +94,7 @@ def test_the_head_of_the_http_answer_arrives_while_a_stop_is_in_progress(
     connection.close()
 
 
-def test_a_stop_continues_when_its_client_disconnects(
-    gateway: Served, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stop_continues_without_its_client(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     ends: list[str] = []
     held = threading.Event()
 
@@ -169,9 +167,7 @@ def gateway(tmp_path: Path) -> Iterator[Served]:
 @pytest.mark.long
 @pytest.mark.slow
 @table("body", UNREADABLE.values(), ids=UNREADABLE)
-def test_a_stop_with_an_unreadable_body_stops_all_drives(
-    gateway: Served, monkeypatch: pytest.MonkeyPatch, body: bytes
-) -> None:
+def test_an_unreadable_stop_stops_all(gateway: Served, monkeypatch: pytest.MonkeyPatch, body: bytes) -> None:
     monkeypatch.setattr(messages, "STOP_BODY_S", 0.1)
     with calling(gateway) as client:
         start(gateway, "pump-1", "pump-2")
@@ -263,9 +259,7 @@ def test_a_stop_works_while_all_gateway_parts_fail(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_stop_works_while_polled_values_and_page_frames_cannot_be_processed(
-    gateway: Served, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stop_works_while_values_cannot_be_shown(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     start(gateway, "pump-1", "pump-2")
 
     def fail(*arguments: object, **more: object) -> None:
@@ -486,9 +480,7 @@ def test_verbs_and_writes_are_answered_with_their_results(gateway: Served) -> No
     )
 
 
-def test_only_stops_are_sent_while_the_audit_log_cannot_be_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_an_audit_log_only_stops_are_sent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(log: AuditLog, *record: object) -> None:
         raise OSError(ENOSPC, "No space left on device")
 

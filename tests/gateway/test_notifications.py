@@ -306,9 +306,7 @@ def test_waiting_for_an_answer_that_arrives_byte_by_byte_has_a_limit(monkeypatch
         ("# https://hooks.example/T0K3N", "has no target"),
     ],
 )
-def test_an_invalid_notification_target_is_refused_without_showing_its_secret(
-    tmp_path: Path, line: str, sentence: str
-) -> None:
+def test_an_invalid_target_is_refused_without_its_secret(tmp_path: Path, line: str, sentence: str) -> None:
     (tmp_path / "targets").write_text(f"{line}\n")
     found, [mistake] = read_targets(tmp_path / "targets")
     assert (found, sentence in mistake, "T0K3N" in mistake) == ([], True, False)
@@ -323,9 +321,7 @@ def test_the_shown_name_of_a_notification_target_contains_no_secret(tmp_path: Pa
     ]
 
 
-def test_a_missing_apprise_library_is_reported_in_one_sentence(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_apprise_library_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "apprise", None)
     (tmp_path / "targets").write_text("ntfy://alarms\n")
     context: Any = SimpleNamespace(plant=SimpleNamespace(path=tmp_path / "plant.toml"), page="")
@@ -348,9 +344,7 @@ def test_apprise_sends_the_title_and_the_text(webhook: SimpleNamespace) -> None:
 
 
 @pytest.mark.slow
-def test_a_gateway_sends_messages_about_faults_and_exceeded_limits(
-    tmp_path: Path, webhook: SimpleNamespace
-) -> None:
+def test_faults_and_exceeded_limits_are_sent_as_messages(tmp_path: Path, webhook: SimpleNamespace) -> None:
     (tmp_path / "targets").write_text(webhook.url)
     limit = '[[serve.limit]]\ndrive = "pump-1"\nregister = "output_frequency"\nabove = 100.0\n'
     below = limit.replace("above = 100.0", "below = 1.0")

@@ -272,9 +272,7 @@ def test_a_token_removed_from_the_file_is_invalid_after_a_reload(tmp_path: Path)
             assert begun_ns <= read_ns <= boottime_ns()
 
 
-def test_values_read_before_a_reload_are_not_shown_after_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_values_before_a_reload_are_not_shown_after(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """After the reload, the name may mean another drive, and this drive may be silent."""
     monkeypatch.setattr(drive_reads, "PAUSE_S", 0.0)
     with served(tmp_path, MAY) as gateway:
@@ -343,9 +341,7 @@ def test_a_start_sent_before_a_reload_does_not_reach_a_new_drive_of_that_name(tm
 
 
 @pytest.mark.slow
-def test_a_stop_of_a_drive_that_a_reload_replaces_is_sent_to_the_new_drive(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stop_of_a_replaced_drive_reaches_the_new(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with two_lines(tmp_path, MAY.replace("pump-1", "fan-1")) as (gateway, _):
         revision = gateway.gateway.revision
         writer = {"authorization": gateway.bearer(Right.WRITE)}
@@ -404,9 +400,7 @@ def held_up(monkeypatch: pytest.MonkeyPatch) -> tuple[threading.Event, threading
 
 @pytest.mark.slow
 @pytest.mark.parametrize("way", ["stop", "coast"])
-def test_a_stop_does_not_wait_for_ports_that_a_reload_opens(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str
-) -> None:
+def test_a_stop_does_not_await_new_ports(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str) -> None:
     """The drive has been replaced already, and the port of another line is still being opened."""
     verbs = '"fan-1.start", "fan-1.coast"'
     may = MAY.replace("pump-1", "fan-1").replace('"fan-1.start"', verbs)
@@ -454,9 +448,7 @@ dc_bus_voltage = { at = 0x3002, unit = "A", step = 0.5, place = "1" }
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_values_of_a_replaced_drive_are_never_recorded_with_the_new_drives_unit(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_values_never_get_the_unit_of_a_new_drive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The new drive has another family. It is polled already while another line is still being opened."""
     (tmp_path / "other.toml").write_text(OTHER)
     with two_lines(tmp_path, "[serve.history]\n" + MAY) as (gateway, _):
@@ -523,9 +515,7 @@ def test_a_stop_in_progress_continues_during_a_reload(tmp_path: Path) -> None:
         assert gateway.gateway.revision == revision + 1
 
 
-def test_an_unexpected_failure_of_a_reload_does_not_prevent_the_next(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_reload_does_not_prevent_the_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class Deaf(BrokenFeed):
         def adopt(self, plant: Plant) -> None:
             raise RuntimeError("no plant")

@@ -95,9 +95,7 @@ def test_a_reload_changes_nothing_if_a_gateway_part_cannot_be_opened(gateway: Se
 
 
 @pytest.mark.slow
-def test_a_reload_changes_nothing_if_a_gateway_part_fails_unexpectedly(
-    gateway: Served, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_part_leaves_all_unchanged(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     first = free_port()
     assert reload(gateway, MODBUS.format(first, 21))["done"] is True
     build, failures = parts_module.build, [MemoryError("no memory")]
@@ -114,9 +112,7 @@ def test_a_reload_changes_nothing_if_a_gateway_part_fails_unexpectedly(
 
 
 @pytest.mark.slow
-def test_a_gateway_part_that_loses_its_port_in_a_failed_reload_is_reported(
-    gateway: Served, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_part_that_loses_its_port_is_reported(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     """The reload fails. Meanwhile, another program has opened the previous port of the Modbus server."""
     first = free_port()
     assert reload(gateway, MODBUS.format(first, 21))["done"] is True
@@ -142,9 +138,7 @@ def test_a_gateway_part_that_loses_its_port_in_a_failed_reload_is_reported(
 
 
 @pytest.mark.slow
-def test_a_gateway_part_that_opens_slowly_does_not_delay_a_stop(
-    gateway: Served, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_slow_part_does_not_delay_a_stop(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     opens, goes_on = threading.Event(), threading.Event()
     build = parts_module.build
 

@@ -259,9 +259,7 @@ def test_invalid_options_of_serve_are_refused(run: Run, words: tuple[str, ...], 
     assert run("serve", *words) == (2, "", f"multidrop: {sentence}\n")
 
 
-def test_a_demo_of_the_web_page_warns_about_ignored_options(
-    run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_demo_of_the_page_warns_about_ignored_options(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(serve_command, "serve_demo", lambda **_: 0)
     code, printed, warned = run("demo", "--web")
     assert (code, printed.split()[0], warned) == (0, "Next:", "")

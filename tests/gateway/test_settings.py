@@ -209,9 +209,7 @@ def test_an_entry_equal_to_the_name_of_a_drive_with_a_star_is_no_pattern(tmp_pat
         ('family.invt-che = ["start"]', "family invt-che: ['start'] is not a table with write, verbs"),
     ],
 )
-def test_patterns_and_families_that_allow_no_drive_are_refused(
-    tmp_path: Path, may: str, sentence: str
-) -> None:
+def test_patterns_and_families_without_a_drive_are_refused(tmp_path: Path, may: str, sentence: str) -> None:
     with pytest.raises(PlantError) as wrong:
         read_settings(written(tmp_path, f"[serve.may]\n{may}\n", *NAMES), {})
     assert any(sentence in mistake for mistake in wrong.value.mistakes), wrong.value.mistakes
@@ -346,9 +344,7 @@ def test_mistakes_in_triggers_are_reported(tmp_path: Path, keys: str, sentences:
         ),
     ],
 )
-def test_a_tcp_port_that_two_interfaces_would_open_is_reported(
-    tmp_path: Path, serve: str, sentence: str
-) -> None:
+def test_a_tcp_port_of_two_interfaces_is_reported(tmp_path: Path, serve: str, sentence: str) -> None:
     assert mistakes(tmp_path, f"{serve}\n") == [f"{sentence}; choose another port"]
 
 
@@ -374,9 +370,7 @@ def test_interfaces_may_use_the_same_tcp_port_on_different_addresses(tmp_path: P
         ("[serve.notify]", "apprise", "notify"),
     ],
 )
-def test_a_missing_library_of_an_interface_is_reported(
-    tmp_path: Path, serve: str, library: str, extra: str
-) -> None:
+def test_a_missing_library_is_reported(tmp_path: Path, serve: str, library: str, extra: str) -> None:
     (tmp_path / "targets").write_text("ntfy://alarms\n")
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(sys.modules, library, None)

@@ -95,9 +95,7 @@ def test_a_gateway_has_exactly_the_expected_tasks_and_threads(gateway: Served) -
 
 
 @pytest.mark.parametrize("name", usually("polling", *sorted(TASKS - {"web", "polling"})))
-def test_when_a_task_was_killed_health_fails_and_stops_are_still_sent(
-    gateway: Served, name: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_stops_are_sent_without_a_task(gateway: Served, name: str, caplog: pytest.LogCaptureFixture) -> None:
     assert dead(gateway) == {}
     in_loop(gateway.loop, lambda found: found.kept[name].cancel())
     until(lambda: dead(gateway) == {name: "it was cancelled"})
@@ -105,9 +103,7 @@ def test_when_a_task_was_killed_health_fails_and_stops_are_still_sent(
     assert all(one["done"] for one in gateway.post("/api/stop").json.values())
 
 
-def test_when_the_poller_fails_health_fails_and_stops_are_still_sent(
-    gateway: Served, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_a_poller_stops_are_still_sent(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail() -> None:
         raise ZeroDivisionError("a bug in a user's class")
 
@@ -127,9 +123,7 @@ def test_a_line_whose_polling_fails_is_reported(gateway: Served, monkeypatch: py
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_a_history_thread_that_ends_makes_health_fail(
-    gateway: Served, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_dead_history_thread_makes_health_fail(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     part: Any = gateway.gateway.feeds["history"]
 
     def leave() -> None:
@@ -327,9 +321,7 @@ async def test_work_that_hangs_raises_hung_and_is_reported_until_later_work_succ
         await asyncio.sleep(0)
 
 
-def test_supervisor_within_raises_an_error_if_no_thread_can_be_started(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_supervisor_within_raises_without_a_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(thread: threading.Thread) -> None:
         raise RuntimeError("can't start new thread")
 

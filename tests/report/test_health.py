@@ -184,9 +184,7 @@ def test_reasons_for_misses_beyond_the_limit_are_combined(tmp_path: Path) -> Non
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_unpainted")
-def test_utilisation_of_a_line_is_computed_from_its_recording(
-    planned: dict[str, Any], turns: list[Row], tmp_path: Path
-) -> None:
+def test_a_recording_gives_the_utilisation(planned: dict[str, Any], turns: list[Row], tmp_path: Path) -> None:
     look = load(record(tmp_path / "it.arrows", turns, ABOUT | {"planned": planned}))
     (line,) = line_uses(look)
     # Pump: 14 ms to the reply's first character, then 8 ms; fan: 13 and 6 ms. The longer of two silences
@@ -210,9 +208,7 @@ def test_utilisation_of_a_network_port_is_at_most_1(planned: dict[str, Any], tmp
     assert 0.9 < line.utilisation <= 1.0 + 1e-9
 
 
-def test_utilisation_counts_requests_that_differ_from_the_plan(
-    planned: dict[str, Any], tmp_path: Path
-) -> None:
+def test_utilisation_counts_requests_outside_the_plan(planned: dict[str, Any], tmp_path: Path) -> None:
     """In the first half, two requests read the pump's two registers, although the plan has one request."""
     rows = [
         row(tick / 10 + (0.05 if name == "fault" and tick < 50 else 0), "pump", name, 1.0, ms=14.0)

@@ -192,9 +192,7 @@ def test_a_spool_file_is_synced_before_it_is_renamed(folder: Path, monkeypatch: 
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(("kills", "longest_s"), first_in_ci((3, 0.2), (12, 0.6)))
-def test_a_process_killed_at_any_moment_loses_no_row_that_it_reported_as_stored(
-    folder: Path, kills: int, longest_s: float
-) -> None:
+def test_a_killed_process_loses_no_row_that_it_reported(folder: Path, kills: int, longest_s: float) -> None:
     """Each run starts at another number. All reported rows are stored once, in order, without gaps."""
     dice = random.Random(kills)
     support = os.pathsep.join(map(str, Path(spooled.__file__).parents[1].iterdir()))
@@ -222,9 +220,7 @@ def test_a_process_killed_at_any_moment_loses_no_row_that_it_reported_as_stored(
 # ---- limits ----
 
 
-def test_a_full_spool_removes_its_oldest_messages_and_counts_unsent_rows(
-    folder: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_full_spool_removes_its_oldest_messages(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
     filled(folder, 1)
     size = next(folder.glob("*.arrows")).stat().st_size
     spool = Spool(folder, GATEWAY, most=size * 5)

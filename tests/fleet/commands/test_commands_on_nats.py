@@ -122,9 +122,7 @@ def tell(fleet: Cluster, tmp_path: Path, gateways: list[OnNats]) -> Callable[[St
     return lambda story: asyncio.run(main(story))
 
 
-def test_a_command_that_arrives_over_three_servers_is_sent_to_the_drive_once(
-    tell: Callable[[Story], None],
-) -> None:
+def test_a_command_received_over_three_servers_is_sent_once(tell: Callable[[Story], None]) -> None:
     async def story(fleet: Fleet) -> None:
         await fleet.one.open()
         answer = await fleet.asker.write("pump", "frequency", 20.0)

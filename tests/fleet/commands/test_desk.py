@@ -46,9 +46,7 @@ def setpoints(desk: Desks) -> list[int]:
 
 
 @patient
-def test_a_confirmed_command_is_logged_before_and_after_it_is_carried_out(
-    desk: Desks, tmp_path: Path
-) -> None:
+def test_a_command_is_logged_before_and_after_it_is_carried_out(desk: Desks, tmp_path: Path) -> None:
     token = desk.offered(20.0)
     assert desk.writes == []
     answer = asyncio.run(desk.do(token))
@@ -85,9 +83,7 @@ def test_copies_of_a_command_request_get_the_same_offer(desk: Desks) -> None:
 
 @patient
 @pytest.mark.parametrize(("seconds", "outcome"), [(0.5, DONE), (1.0, NOT_SENT), (60.0, NOT_SENT)])
-def test_a_confirmation_more_than_a_second_after_the_offer_sends_nothing(
-    desk: Desks, seconds: float, outcome: CommandOutcome
-) -> None:
+def test_a_late_confirmation_sends_nothing(desk: Desks, seconds: float, outcome: CommandOutcome) -> None:
     token = desk.offered()
     desk.clock.pass_s(seconds)
     answer = asyncio.run(desk.do(token))
@@ -176,9 +172,7 @@ MEANWHILE: dict[str, Callable[[Desks], object]] = {
 @patient
 @pytest.mark.parametrize("deed", MEANWHILE)
 @pytest.mark.parametrize("is_late", [False, True])
-def test_a_command_is_not_sent_once_its_offer_has_become_invalid(
-    desk: Desks, deed: str, is_late: bool
-) -> None:
+def test_a_command_with_an_invalid_offer_is_not_sent(desk: Desks, deed: str, is_late: bool) -> None:
     """The offer becomes invalid before it is confirmed, or between its confirmation and the write."""
     if is_late:
         answer = while_noted(desk, lambda: MEANWHILE[deed](desk))
@@ -303,9 +297,7 @@ LOSSES: dict[str, Callable[[Desks], object]] = {
 
 @patient
 @pytest.mark.parametrize("loss", LOSSES)
-def test_a_gateway_that_loses_a_line_does_not_answer_the_lines_stop(
-    desk: Desks, monkeypatch: pytest.MonkeyPatch, loss: str
-) -> None:
+def test_a_lost_lines_stop_is_not_answered(desk: Desks, monkeypatch: pytest.MonkeyPatch, loss: str) -> None:
     """The line's next master gets a copy of the stop, and answers it.
 
     If this gateway is the master again later, it answers the next copy.
@@ -498,9 +490,7 @@ def test_a_malformed_stop_is_carried_out(
         ({"id": "one", "drives": ["fan"]}, {"id": "one", "drives": ["pump"]}),
     ],
 )
-def test_a_stop_message_with_another_id_is_a_new_stop(
-    desk: Desks, first: dict[str, Any], then: dict[str, Any]
-) -> None:
+def test_another_id_makes_a_stop_new(desk: Desks, first: dict[str, Any], then: dict[str, Any]) -> None:
     asyncio.run(desk.stop_by(json.dumps(first).encode()))
     before = len(desk.writes)
     asyncio.run(desk.stop_by(json.dumps(then).encode()))
@@ -624,9 +614,7 @@ def test_a_hanging_disk_or_port_does_not_block_the_gateways_exit(tmp_path: Path,
 
 
 @pytest.mark.slow
-def test_only_one_of_many_stops_of_a_silent_drive_is_repeated(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_one_of_many_stops_of_a_silent_drive_repeats(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The first stop is being repeated while eight more arrive.
 
     All nine get the result of a repeated stop.

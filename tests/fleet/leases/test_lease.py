@@ -210,9 +210,7 @@ async def test_a_session_ends_even_if_its_last_renewal_is_stored_late() -> None:
 
 
 @pytest.mark.parametrize("later", [{"nonce": "another's"}, {"ended": True, "by": "b"}])
-async def test_the_record_that_ends_a_session_replaces_only_its_own_renewals(
-    later: dict[str, Any],
-) -> None:
+async def test_the_record_that_ends_a_session_replaces_only_its_own_renewals(later: dict[str, Any]) -> None:
     trial, lease = await begun()
     trial.buckets[0].store("a", {**trial.values()[0], **later})
     await lease.end()
@@ -377,9 +375,7 @@ async def test_a_starting_session_replaces_no_record_of_a_living_session() -> No
     assert not second.is_valid
 
 
-async def test_a_released_lock_file_proves_that_the_previous_process_is_dead(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_released_lock_file_proves_death(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(leases, "machine_id", lambda: "this machine")
     trial = Trial()
     lock = LifeLock(tmp_path / "a.lock")
@@ -417,9 +413,7 @@ async def test_another_lock_file_does_not_prove_that_the_previous_process_is_dea
         assert not await trial.lease(lock=lock).try_to_begin()
 
 
-async def test_a_lock_file_from_another_boot_does_not_prove_a_process_dead(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_lock_of_another_boot_proves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A copied disk has the same machine id, path and lock id, but not the same boot id of the kernel."""
     trial = Trial()
     machine, boot = tmp_path / "machine-id", tmp_path / "boot_id"
@@ -437,9 +431,7 @@ async def test_a_lock_file_from_another_boot_does_not_prove_a_process_dead(
 
 
 @pytest.mark.parametrize("empty", [0, 1])
-def test_a_machine_without_a_machine_id_or_boot_id_has_no_id(
-    empty: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_boot_id_means_no_machine_id(empty: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ids = (tmp_path / "machine-id", tmp_path / "boot_id")
     for path in ids:
         path.write_text("something\n", "utf-8")

@@ -200,9 +200,7 @@ class Ports:
 
 @pytest.mark.slow
 @pytest.mark.long
-async def test_lines_that_a_gateway_cannot_open_move_to_other_gateways_and_return(
-    fleet: Cluster, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_lines_that_cannot_be_opened_move(fleet: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
     """A gateway is cut off from its lines but not from the servers, so its lease stays valid."""
     monkeypatch.setattr(shares, "LOST_NS", SECOND // 2)
     # longer than a failed attempt to open a line again, which takes up to 2 s
@@ -242,9 +240,7 @@ async def test_a_drained_gateway_releases_all_lines_and_claims_none(fleet: Clust
 
 @pytest.mark.slow
 @pytest.mark.long
-def test_while_a_server_is_silent_only_a_draining_gateway_releases_lines(
-    fleet: Cluster, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_a_draining_gateway_releases_lines(fleet: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
     silent = Replica("n3", is_current=False, is_offline=True, active_ns=0)
 
     async def maimed(*_: object) -> Servers:
@@ -298,9 +294,7 @@ async def test_lines_are_added_changed_and_removed_with_the_plant(fleet: Cluster
 
 @pytest.mark.slow
 @pytest.mark.long
-async def test_no_line_is_claimed_while_an_incompatible_gateway_is_alive(
-    fleet: Cluster, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_an_incompatible_gateway_stops_claims(fleet: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
     """The incompatible gateway is alive at the start of this gateway, or joins the fleet later."""
     async with gateways(fleet, terms=LONG) as running, other_version(fleet, monkeypatch) as other:
         await other.begin()
@@ -393,9 +387,7 @@ async def test_sessions_without_a_third_lease_record_are_given_up_one_after_anot
 
 @pytest.mark.slow
 @pytest.mark.long
-async def test_without_servers_all_lines_are_closed_and_no_gateway_is_killed(
-    fleet: Cluster, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_without_servers_all_lines_are_closed(fleet: Cluster, caplog: pytest.LogCaptureFixture) -> None:
     """The kernel's timer is cancelled when the lines are closed, and never set to a time in the past."""
     async with gateways(fleet, "a", "b") as running:
         await until(running.are_shared, "shares")  # until each gateway has had a lease and a timer

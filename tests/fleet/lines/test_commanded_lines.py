@@ -181,9 +181,7 @@ class ClosedLines(SlowLines):
 
 
 @pytest.mark.parametrize("drives", [None, ["pump"]])
-async def test_a_gateway_does_not_answer_a_stop_if_the_lines_bus_is_closed(
-    desk: Desks, drives: list[str] | None
-) -> None:
+async def test_a_stop_on_a_closed_bus_is_not_answered(desk: Desks, drives: list[str] | None) -> None:
     """If this gateway refused the stop, the sender would not try another gateway."""
 
     lines = ClosedLines(desk.bus.close)
@@ -352,16 +350,12 @@ def test_a_request_abandoned_when_polling_ends_has_a_row_with_that_status(
         ((1, 2, 2, 3), 3, Verdict(doubled=1)),
     ],
 )
-def test_judge_drive_counts_lost_doubled_and_late_replies(
-    numbers: Sequence[int | None], answered: int, expected: Verdict
-) -> None:
+def test_judge_drive_counts_replies(numbers: Sequence[int | None], answered: int, expected: Verdict) -> None:
     assert judge_drive(numbers, answered) == expected
 
 
 @pytest.mark.long
-def test_a_reply_that_comes_too_late_has_a_row_marked_as_late(
-    tmp_path: Path, gateways: list[Gateway]
-) -> None:
+def test_a_late_reply_has_a_row_marked_as_late(tmp_path: Path, gateways: list[Gateway]) -> None:
     with simulated_line(tmp_path, delay=0.02) as (drives, line):
         gateways[0].poller.add_line(line)
         for delay in (0.02, 0.45, 0.02, 0.9, 0.02):

@@ -333,9 +333,7 @@ async def test_if_all_lease_records_are_renewed_late_buckets_keep_their_order() 
     assert owners(trial) == [ME, ME, NOBODY]
 
 
-async def test_a_claim_soon_gives_up_on_a_bucket_whose_home_server_may_have_failed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+async def test_a_claim_does_not_wait_for_a_failed_home_server(monkeypatch: pytest.MonkeyPatch) -> None:
     """The gateway must write a new line's first record in this bucket. It cannot use another bucket."""
     monkeypatch.setattr(line_keeper, "SPARE_S", 0.0)
     trial = Trial()
@@ -359,9 +357,7 @@ async def test_a_claim_fails_if_another_gateway_has_written_a_record_first() -> 
     assert not trial.keeper.polled
 
 
-async def test_a_late_answer_to_a_claim_does_not_reopen_a_line_being_released(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+async def test_a_late_claim_does_not_reopen_a_released_line(monkeypatch: pytest.MonkeyPatch) -> None:
     """Otherwise the line would be opened while the records of its release are being written."""
     monkeypatch.setattr(line_keeper, "SPARE_S", 0.0)
     trial = DeadTrial()
@@ -525,9 +521,7 @@ async def test_a_line_that_cannot_be_opened_is_logged_once_per_reason(
     ]
 
 
-async def test_the_error_of_a_line_is_forgotten_when_another_gateway_polls_it(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+async def test_the_error_of_a_line_polled_elsewhere_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
     trial = BrokenTrial(monkeypatch)
     await trial.claim()
     trial.keeper.releasing = {"hall"}
@@ -546,9 +540,7 @@ async def test_the_error_of_a_line_is_forgotten_when_another_gateway_polls_it(
         (PortLoss("no route to host", SECOND), "no route to host"),
     ],
 )
-async def test_a_lost_port_is_reported_before_the_attempt_to_reopen_it_has_failed(
-    loss: PortLoss, reported: str | None
-) -> None:
+async def test_a_lost_port_is_reported_before_it_is_reopened(loss: PortLoss, reported: str | None) -> None:
     trial = await claimed()
     await until(lambda: "hall" in trial.keeper.polled)
     await until(lambda: not trial.keeper._at_work)

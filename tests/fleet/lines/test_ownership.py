@@ -248,9 +248,7 @@ def test_servers_are_checked_only_while_lines_wait_for_release(monkeypatch: pyte
     assert trial.releases.due(FIRST_LINES) == set()
 
 
-def test_lines_are_not_released_while_two_buckets_have_a_silent_server(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_no_line_is_released_while_two_buckets_are_silent(monkeypatch: pytest.MonkeyPatch) -> None:
     trial = Releasing(monkeypatch)
     trial.maimed = {"own_0", "own_1"}
     trial.releases.due(FIRST_LINES)
@@ -280,9 +278,7 @@ def test_lines_are_released_although_a_server_is_silent_for_60_s(monkeypatch: py
     assert trial.releases.due(FIRST_LINES) == set()
 
 
-def test_a_draining_gateway_does_not_wait_for_silent_servers(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_draining_gateway_does_not_wait_for_silent_servers(monkeypatch: pytest.MonkeyPatch) -> None:
     trial = Releasing(monkeypatch)
     trial.maimed = set(names.OWNERS)
     trial.led.remove("own_2")

@@ -84,9 +84,7 @@ def test_records_of_a_line_that_this_gateway_owns_already_are_not_read() -> None
     assert not trial.asks()
 
 
-def test_a_record_with_an_unanswered_write_is_read_again_for_30_s(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_record_with_an_unanswered_write_is_read_again_for_30_s(monkeypatch: pytest.MonkeyPatch) -> None:
     """The write may still be stored once the bucket has a leader again."""
     now = 1000.0
     monkeypatch.setattr(line_records.time, "monotonic", lambda: now)

@@ -67,9 +67,7 @@ def weight(line: str, gateway: str, number: int) -> int:
 
 @table("number", [1, 2, 3, 5, 20])
 @table("lines", [1, 7, 40, 333])
-def test_each_line_is_assigned_to_the_gateway_of_greatest_weight_that_has_room(
-    lines: int, number: int
-) -> None:
+def test_each_line_has_the_gateway_of_greatest_weight_that_has_room(lines: int, number: int) -> None:
     """All versions must use the same weights; otherwise they would move lines back and forth."""
     room = dict.fromkeys(GATEWAYS[:number], -(-lines * 110 // (100 * number)))
     wanted = {}
@@ -186,9 +184,7 @@ def test_a_polled_line_is_reported_when_its_port_is_lost_for_6_s() -> None:
     ("silent_s", "named_after_s"),
     [(2.0, 4.0), (REPLY_NS / SECOND, 3.0), (60.0, 6.0), (None, 6.0)],  # None: the line never had a reply
 )
-def test_a_line_is_reported_6_s_after_its_last_reply_if_its_port_is_lost(
-    silent_s: float | None, named_after_s: float
-) -> None:
+def test_a_line_with_a_lost_port_is_reported_after_6_s(silent_s: float | None, named_after_s: float) -> None:
     """A gateway notices a cut line only after seconds, so the 6 s start at the last reply before the cut."""
     clock = HandClock()
     unopened = UnopenedLines(clock)

@@ -150,9 +150,7 @@ def test_the_hub_waits_for_a_server_without_the_streams_newest_messages(
 
 @pytest.mark.long
 @pytest.mark.parametrize("fates", ["", "bababb", "aaaa"])
-async def test_the_hub_stores_each_row_once_despite_failures_of_the_sink(
-    running: Cluster, fates: str
-) -> None:
+async def test_each_row_is_stored_once_although_the_sink_fails(running: Cluster, fates: str) -> None:
     async with empty_stream(running) as path:
         await say_all(path, 1, 31)
         sink = Memory(fates)
@@ -163,9 +161,7 @@ async def test_the_hub_stores_each_row_once_despite_failures_of_the_sink(
 
 
 @pytest.mark.slow
-async def test_messages_that_need_several_reads_are_stored_once(
-    running: Cluster, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_messages_in_parts_are_stored_once(running: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hub_module, "MOST_READ", 3)
     async with empty_stream(running) as path:
         await say_all(path, 1, 12)
@@ -194,9 +190,7 @@ async def test_the_hub_limits_the_memory_of_a_commit(
 
 
 @pytest.mark.slow
-def test_the_hub_logs_and_counts_missing_and_duplicated_messages(
-    running: Cluster, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_the_hub_counts_lost_and_doubled_messages(running: Cluster, caplog: pytest.LogCaptureFixture) -> None:
     async def live() -> HubState:
         async with empty_stream(running) as path:
             for sequence, source in ((1, "a.x"), (3, "b.x"), (2, "a.x"), (5, "a.x"), (5, "a.x"), (4, "a.x")):
@@ -227,9 +221,7 @@ def test_the_hub_logs_and_counts_missing_and_duplicated_messages(
     ]
 
 
-async def test_the_hub_reports_messages_that_the_stream_has_removed(
-    running: Cluster, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_the_hub_reports_removed_messages(running: Cluster, caplog: pytest.LogCaptureFixture) -> None:
     async with empty_stream(running) as path:
         await say_all(path, 1, 6)
         await samples_stream._ask(path, "STREAM.PURGE.samples", {"seq": 4})
@@ -295,9 +287,7 @@ async def test_hub_files_are_read_by_history_and_duckdb(running: Cluster, tmp_pa
     assert told == (len(one_drive), sum(v is not None for v in one_drive), sum(filter(None, one_drive)))
 
 
-async def test_the_hub_ignores_a_file_that_a_killed_hub_left_unfinished(
-    running: Cluster, tmp_path: Path
-) -> None:
+async def test_the_hub_ignores_an_unfinished_file(running: Cluster, tmp_path: Path) -> None:
     """A killed hub leaves an unfinished file. The next hub reads the file's rows again from the stream."""
     async with empty_stream(running) as path:
         await say(path, 1, message(5))
@@ -317,9 +307,7 @@ def commit_of(
     return Commit(stream, first, last, sources or {"a.x": last}, [table], len(table))
 
 
-def test_a_parquet_file_is_synced_before_it_is_renamed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_parquet_file_is_synced_before_its_rename(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Otherwise a power cut could leave an incomplete file."""
     calls: list[str] = []
     really_synced, really_renamed = os.fsync, Path.replace

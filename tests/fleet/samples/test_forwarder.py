@@ -146,9 +146,7 @@ async def test_the_forwarder_stores_the_spools_messages_in_order(running: Cluste
     spool.close()
 
 
-async def test_a_restarted_gateway_continues_after_the_last_stored_message(
-    running: Cluster, tmp_path: Path
-) -> None:
+async def test_a_restarted_gateway_continues_after_the_last_message(running: Cluster, tmp_path: Path) -> None:
     async with empty_stream(running) as path:
         for run in range(3):
             spool = Spool(tmp_path / "spool", "gateway-1")
@@ -188,9 +186,7 @@ class Lossy:
 
 
 @pytest.mark.parametrize("fates", ["aaaaaaa", "bbabab", "ababaaabb", "llaboabl", "alolalolb"])
-async def test_each_message_is_stored_once_although_messages_or_answers_are_lost(
-    running: Cluster, tmp_path: Path, fates: str
-) -> None:
+async def test_lost_messages_or_answers_are_repeated(running: Cluster, tmp_path: Path, fates: str) -> None:
     spool = filled(tmp_path / "spool", 6)
     async with empty_stream(running) as path, forwarding(spool, Lossy(path, fates)) as forwarder:
         await until(lambda: forwarder.last == 6)
@@ -199,9 +195,7 @@ async def test_each_message_is_stored_once_although_messages_or_answers_are_lost
     spool.close()
 
 
-async def test_the_forwarder_ignores_server_answers_among_its_gateways_samples(
-    running: Cluster, tmp_path: Path
-) -> None:
+async def test_the_forwarder_ignores_answers_of_servers(running: Cluster, tmp_path: Path) -> None:
     """Any client may direct a server's answer to the subject of a gateway's samples.
 
     It is not one of the gateway's messages.
@@ -244,9 +238,7 @@ async def test_a_stream_that_refuses_messages_is_logged_once(
     ]
 
 
-async def test_the_forwarder_skips_messages_that_the_full_spool_has_removed(
-    running: Cluster, tmp_path: Path
-) -> None:
+async def test_the_forwarder_skips_messages_removed_from_the_spool(running: Cluster, tmp_path: Path) -> None:
     filled(tmp_path / "spool", 5).close()
     spool = Spool(tmp_path / "spool", "gateway-1", most=1)
     await store(spool, 25)
@@ -318,9 +310,7 @@ async def test_the_largest_message_is_stored_and_read_back(running: Cluster) -> 
 
 
 @pytest.mark.slow
-async def test_the_forwarder_reports_a_missing_stream_and_waits_for_it(
-    running: Cluster, tmp_path: Path
-) -> None:
+async def test_the_forwarder_waits_for_a_missing_stream(running: Cluster, tmp_path: Path) -> None:
     async with empty_stream(running) as path:
         await samples_stream._ask(path, "STREAM.DELETE.samples", {})
         for asked in (stream_info(path), last_of(path, "samples.a.b")):
@@ -408,9 +398,7 @@ def test_the_check_after_random_kills_finds_the_hubs_alarms(
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_no_sample_is_lost_when_gateway_hub_and_servers_are_killed_at_random(
-    chaos: Any, tmp_path: Path
-) -> None:
+def test_no_sample_is_lost_at_random_kills(chaos: Any, tmp_path: Path) -> None:
     wrong = chaos.run(tmp_path, 12.0, random.Random(2))
     print(*(f"{path.name}: {path.read_text()[-2000:]}" for path in tmp_path.glob("*.log")), sep="\n")
     assert wrong == 0

@@ -164,9 +164,7 @@ def test_a_plot_of_a_hubs_folder_shows_only_the_newest_unit_of_a_register(kept: 
 
 
 @pytest.mark.long
-def test_a_register_whose_unit_has_changed_is_exported_as_one_column_per_unit(
-    kept: Path, tmp_path: Path
-) -> None:
+def test_each_unit_of_a_register_is_exported_as_a_column(kept: Path, tmp_path: Path) -> None:
     with History(kept) as history:
         rows = history.read("pump-1.value_1", BEGIN, END)
         about = rows.metadata["drives"]["pump-1"]["registers"]

@@ -55,9 +55,7 @@ def test_nats_py_still_has_the_method_that_receives_answers() -> None:
     assert inspect.iscoroutinefunction(Client._process_msg)
 
 
-async def test_answers_to_batches_bypass_the_queue_of_nats_py(
-    one: Cluster, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_answers_to_batches_bypass_nats_py(one: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
     async def fail(self: BatchClient, message: object) -> None:
         raise AssertionError("it came in nats-py's own way")
 
@@ -101,9 +99,7 @@ def test_headers_that_belong_to_no_stored_message_end_an_answer(headers: bytes) 
     assert stored_message(headers, b"") is None
 
 
-async def test_a_record_that_imitates_an_answers_end_does_not_hide_later_records(
-    one: Cluster, way: str
-) -> None:
+async def test_a_record_that_imitates_an_answers_end_hides_no_record(one: Cluster, way: str) -> None:
     async with connected_path(one) as path:
         bucket = Bucket("own_0", lambda: path)
         await bucket.put(f"{way}-a", OWNER, 0)
@@ -122,9 +118,7 @@ async def test_a_record_that_imitates_an_answers_end_does_not_hide_later_records
         assert keys == [f"{way}-a", f"{way}-b", f"{way}-c"]
 
 
-async def test_in_a_batch_of_writes_each_record_is_replaced_only_at_its_revision(
-    one: Cluster, way: str
-) -> None:
+async def test_each_record_of_a_batch_is_replaced_only_at_its_revision(one: Cluster, way: str) -> None:
     async with connected_path(one) as path:
         bucket = Bucket("own_1", lambda: path)
         a, b, c = f"{way}-a", f"{way}-b", f"{way}-c"

@@ -339,9 +339,7 @@ def test_no_bucket_is_handed_over_because_a_servers_copy_lags_behind(servers: Se
 
 
 @pytest.mark.parametrize(("unheard_ns", "is_due"), [(1_900_000_000, False), (2_100_000_000, True), (0, True)])
-def test_a_server_counts_as_silent_after_two_seconds_without_a_message(
-    servers: Servers, unheard_ns: int, is_due: bool
-) -> None:
+def test_a_server_is_silent_after_two_seconds(servers: Servers, unheard_ns: int, is_due: bool) -> None:
     servers.silent, servers.unheard_ns = {"n3"}, unheard_ns
     servers.pass_s(1)
     assert (servers.terms[names.LEASES[0]] > 1) is is_due
@@ -407,9 +405,7 @@ def test_a_leader_that_does_not_answer_delays_no_hand_over_of_other_buckets(serv
 
 
 @pytest.mark.parametrize("cut_after_s", [0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7])
-def test_raft_terms_are_newer_before_a_cut_off_server_starts_an_election(
-    cut_after_s: float, servers: Servers
-) -> None:
+def test_raft_terms_are_newer_before_an_election_starts(cut_after_s: float, servers: Servers) -> None:
     """A leader on the cut-off server does not answer.
 
     Leaders on other servers report it as silent after 2 s.

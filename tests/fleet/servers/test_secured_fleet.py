@@ -107,9 +107,7 @@ def test_a_missing_right_is_reported_in_one_sentence(
 
 
 @pytest.mark.slow
-def test_a_stored_message_directed_into_another_gateways_samples_is_ignored(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_samples_from_another_gateway_are_ignored(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """With one NATS account for all users, servers would send stored messages to any reply subject."""
 
     async def main(servers: SecuredCluster) -> None:
@@ -198,9 +196,7 @@ def test_mistaken_credentials_are_reported_in_one_sentence(
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_a_client_that_requires_tls_sends_no_data_to_a_server_without_tls(
-    run: Run, servers: SecuredCluster, tmp_path: Path
-) -> None:
+def test_no_data_is_sent_to_a_server_without_tls(run: Run, servers: SecuredCluster, tmp_path: Path) -> None:
     """Otherwise an attacker between client and server could read and relay the login."""
     with cluster(tmp_path / "plain", 1) as plain:
         url = plain.urls[0].replace("nats://", "tls://")
@@ -213,9 +209,7 @@ def test_a_client_that_requires_tls_sends_no_data_to_a_server_without_tls(
 
 
 @pytest.mark.long
-def test_a_server_that_requires_tls_is_reported_to_a_client_without_tls(
-    run: Run, servers: SecuredCluster
-) -> None:
+def test_a_client_without_tls_is_told_that_tls_is_required(run: Run, servers: SecuredCluster) -> None:
     status, _, err = run("fleet", "status", "--nats", servers.urls[0].replace("tls://", "nats://"))
     assert status == 1
     assert "no answer in time; write tls:// if it requires TLS" in err
@@ -230,9 +224,7 @@ def test_a_client_trusts_only_certificates_of_the_given_authority(servers: Secur
 
 
 @pytest.mark.long
-def test_without_a_quorum_each_command_is_reported_in_one_sentence(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_commands_without_a_quorum_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with secured_cluster(tmp_path / "nats", 3) as servers:
         asyncio.run(make_streams(servers))
         for node in servers.nodes[1:]:
@@ -374,9 +366,7 @@ def test_servers_send_no_answer_to_another_users_subject(tmp_path: Path, number:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [1, pytest.param(3, marks=pytest.mark.long)])
-def test_with_one_account_for_all_users_answers_reach_other_users_subjects(
-    tmp_path: Path, number: int
-) -> None:
+def test_with_one_account_answers_reach_other_users(tmp_path: Path, number: int) -> None:
     with secured_cluster(tmp_path, number, TWO_GATEWAYS, in_one_account) as servers:
         wanted = {subject for subjects in foreign(servers).values() for subject in subjects}
         assert asyncio.run(arrivals(servers, wanted)) == wanted

@@ -92,9 +92,7 @@ def test_lines_can_be_claimed_while_two_of_three_buckets_have_a_leader(said: byt
 
 
 @pytest.mark.slow
-def test_init_refuses_servers_that_accept_two_writes_to_one_revision(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_init_refuses_two_writes_to_one_revision(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Old servers accept two concurrent writes to one revision. Their version is not checked in this test."""
     monkeypatch.setattr(servers, "OLDEST", (0, 0))
     with cluster(tmp_path, 3, old_server_program()) as old:
@@ -103,9 +101,7 @@ def test_init_refuses_servers_that_accept_two_writes_to_one_revision(
             asyncio.run(_init(old.urls))
 
 
-def test_init_refuses_servers_that_ignore_records_of_other_writers(
-    nats: Cluster, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_init_refuses_servers_that_ignore_a_writer(nats: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
     """Such servers would grant a lease to two gateways. Some of their answers may arrive too late."""
     monkeypatch.setattr(LeaseBucket, "_pattern", LeaseBucket._subject)
     with pytest.raises(FleetError, match=r"accepted [2-6] of 6 concurrent writes to the same revision"):
@@ -161,9 +157,7 @@ def test_init_needs_all_servers_only_when_it_creates_buckets(tmp_path: Path) -> 
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_servers_without_a_quorum_are_reported_in_one_sentence(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_servers_without_a_quorum_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(setup, "WAIT_S", 1.0)
     with cluster(tmp_path, 3) as three:
         for node in three.nodes[1:]:
@@ -178,9 +172,7 @@ NO_LEADER = (
 
 
 @pytest.mark.slow
-def test_servers_that_cannot_decide_are_reported_as_no_quorum(
-    nats: Cluster, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_servers_that_cannot_decide_have_no_quorum(nats: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(setup, "WAIT_S", 0.5)
 
     async def refuse(self: ServerPath, subject: str, *rest: object, **more: object) -> SimpleNamespace:
@@ -207,9 +199,7 @@ def test_init_waits_until_a_new_plant_can_be_read(nats: Cluster, monkeypatch: py
 
 
 @pytest.mark.slow
-def test_a_server_without_jetstream_is_reported_in_one_sentence(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_server_without_jetstream_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(setup, "WAIT_S", 0.5)
     [port] = free_ports(1)
     command = [server_program(), "-a", "127.0.0.1", "-p", str(port)]
@@ -226,9 +216,7 @@ def test_a_server_without_jetstream_is_reported_in_one_sentence(
 
 
 @pytest.mark.slow
-def test_a_bucket_without_a_leader_is_reported_as_no_quorum(
-    fleet: Cluster, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_bucket_without_a_leader_has_no_quorum(fleet: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
     """The last running server of a cluster answers for some seconds, but names no leader in its answers."""
     told = setup.ask
 
@@ -244,9 +232,7 @@ def test_a_bucket_without_a_leader_is_reported_as_no_quorum(
 
 
 @pytest.mark.slow
-def test_init_waits_for_the_election_of_a_buckets_leader(
-    fleet: Cluster, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_init_waits_for_the_election_of_a_leader(fleet: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
     """Most servers run, but the bucket's leader has died, and the election of the next one takes a moment."""
     told, silent = setup.ask, ["STREAM.INFO.KV_lease_1"] * 3
 

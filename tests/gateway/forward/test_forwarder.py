@@ -163,9 +163,7 @@ def test_a_restarted_forwarder_continues_after_the_last_sent_message(tmp_path: P
     assert [one.is_historical for one in second.receiver.messages[3:]] == [False, True]
 
 
-def test_a_message_without_an_acknowledgement_is_sent_again_with_the_same_id(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_unacknowledged_message_keeps_its_id(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     first = Clocked(tmp_path / "spool")
     store(first.spool, 0, 5)
     with monkeypatch.context() as patch:
@@ -181,9 +179,7 @@ def test_a_message_without_an_acknowledgement_is_sent_again_with_the_same_id(
 
 
 @pytest.mark.parametrize("text", ["", "{}", '{"newest": "x", "gaps": []}', '{"newest": 2, "gaps": [1]}'])
-def test_all_spooled_messages_are_sent_again_if_the_position_file_is_damaged(
-    tmp_path: Path, text: str
-) -> None:
+def test_all_messages_are_sent_again_if_the_position_file_is_damaged(tmp_path: Path, text: str) -> None:
     first = Clocked(tmp_path / "spool")
     first.receiver.failure = OSError("away")
     for number in range(2):

@@ -98,9 +98,7 @@ from multidrop.samples import SpoolState, unpack
         ('[serve.mqtt]\nrows = true\nmost = "1"', "[serve.mqtt]: most = invalid size '1': write 1 kB or"),
     ],
 )
-def test_each_mistake_in_the_forwarding_settings_is_reported_in_one_sentence(
-    tmp_path: Path, serve: str, mistake: str
-) -> None:
+def test_each_forwarding_mistake_is_one_sentence(tmp_path: Path, serve: str, mistake: str) -> None:
     with pytest.raises(PlantError) as wrong:
         read_settings(written(tmp_path, serve), {})
     [found] = wrong.value.mistakes
@@ -165,9 +163,7 @@ def test_a_hanging_receiver_delays_neither_polling_nor_stops_nor_the_shutdown(tm
 
 
 @pytest.mark.slow
-def test_new_rows_do_not_wait_while_the_disk_hangs_at_deleting_a_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_rows_do_not_wait_for_a_hanging_deletion(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     part = forwarding("upload", "http://localhost:9/", tmp_path)
     store(part._spool, 0, 5)
     part._spool.acknowledge(1)
@@ -212,9 +208,7 @@ def test_health_reports_lost_rows_until_the_backlog_is_sent(tmp_path: Path) -> N
     spool.close()
 
 
-def test_rows_are_written_to_stdout_in_the_influx_line_protocol(
-    tmp_path: Path, capfdbinary: pytest.CaptureFixture[bytes]
-) -> None:
+def test_stdout_rows_are_in_line_protocol(tmp_path: Path, capfdbinary: pytest.CaptureFixture[bytes]) -> None:
     part = forwarding("influx", "stdout", tmp_path)
     store(part._spool, 0, 1)
     part._forwarder.step()
@@ -224,9 +218,7 @@ def test_rows_are_written_to_stdout_in_the_influx_line_protocol(
     assert len(lines) == 10
 
 
-def test_a_hanging_reader_of_stdout_does_not_block_a_flush_by_another_thread(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_hanging_stdout_blocks_no_other_thread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     part = forwarding("influx", "stdout", tmp_path)
     store(part._spool, 0, 150)  # more bytes than the buffer of a pipe
     reading, writing = os.pipe()
@@ -269,9 +261,7 @@ def batch_at(time_ns: int) -> Any:
     return Batch(columns, Names(["pump-1"]), Names(["load"]))
 
 
-def test_rows_whose_unit_is_unknown_after_a_reload_are_not_sent(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_rows_of_unknown_unit_are_not_sent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     sent: list[Any] = []
     monkeypatch.setattr(forwarder, "monotonic_ns", lambda: 1000)
     made: Any = Forwarding(  # type: ignore[arg-type]

@@ -101,9 +101,7 @@ def connected(gateway: Served) -> Iterator[socket.socket]:
         yield client
 
 
-def test_a_request_whose_body_does_not_arrive_is_answered_with_408(
-    gateway: Served, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_body_is_answered_with_408(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(messages, "BODY_S", 0.1)
     with connected(gateway) as client:
         client.sendall(SLOW[2])
@@ -111,9 +109,7 @@ def test_a_request_whose_body_does_not_arrive_is_answered_with_408(
     assert gateway.get("/api/plant").status == 200
 
 
-def test_a_connection_whose_headers_do_not_arrive_is_closed(
-    gateway: Served, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unfinished_headers_close_a_connection(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connections, "FIRST_S", 0.1)
     with connected(gateway) as client:
         client.sendall(SLOW[1])
@@ -275,9 +271,7 @@ async def test_one_request_starts_per_event_loop_cycle_and_stops_start_first() -
     assert order[-1] == "later"
 
 
-def test_stop_is_answered_before_reads_that_arrived_earlier(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_stop_is_answered_before_earlier_reads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """20 clients send 5 requests each at the same time and read no answers."""
     order: list[str] = []
     come, go_on = threading.Event(), threading.Event()
@@ -334,9 +328,7 @@ def test_unfinished_request_is_answered_with_503_at_shutdown(
     assert "Traceback" not in caplog.text
 
 
-def test_a_client_that_pipelines_requests_counts_as_greedy_until_answered(
-    gateway: Served, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_pipelining_client_counts_as_greedy(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     go_on = asyncio.Event()
 
     async def after(n: int) -> None:

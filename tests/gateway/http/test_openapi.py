@@ -88,9 +88,7 @@ def test_commands_with_unknown_drives_verbs_or_options_are_refused(gateway: Serv
     assert (answer.status, answer.json["error"].startswith(sentence)) == (status, True)
 
 
-def test_answer_and_log_and_audit_log_have_the_id_of_the_command(
-    gateway: Served, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_answer_and_logs_have_the_commands_id(gateway: Served, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     setpoint = {"drive": "pump-1", "register": "setpoint", "value": 40.0}
     written = gateway.command("/api/write", {**setpoint, "id": "order-7"}).json
@@ -152,9 +150,7 @@ def test_long_answers_are_compressed(gateway: Served, path: str) -> None:
         ("?lang=de", "ru", "output frequency"),
     ],
 )
-def test_registers_have_titles_in_the_language_of_the_request(
-    gateway: Served, query: str, accepted: str, title: str
-) -> None:
+def test_register_titles_are_translated(gateway: Served, query: str, accepted: str, title: str) -> None:
     answer = gateway.get(f"/api/plant{query}", accept_language=accepted, accept_encoding="gzip")
     assert answer.headers["vary"] == "accept-language, accept-encoding"
     registers = json.loads(gzip.decompress(answer.body))["lines"][0]["drives"][0]["registers"]
@@ -337,9 +333,7 @@ def test_files_outside_the_folder_of_the_web_page_are_not_served(gateway: Served
     assert (answer.status, answer.json) == (404, {"error": "unknown path"})
 
 
-def test_a_gateway_installed_without_the_web_page_answers_404(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_gateway_without_a_web_page_answers_404(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(files.PageFiles.__init__, "__defaults__", (tmp_path / "missing",))
     with served(tmp_path) as gateway:
         assert "this version of multidrop has no page" in gateway.get("/").json["error"]

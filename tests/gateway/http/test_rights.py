@@ -91,9 +91,7 @@ TABLE = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("serve", "address"), TABLE)
-def test_callers_have_the_rights_that_their_token_and_the_settings_give(
-    tmp_path: Path, serve: str, address: str
-) -> None:
+def test_rights_follow_from_token_and_settings(tmp_path: Path, serve: str, address: str) -> None:
     with served(tmp_path, serve, behind_proxy=address is OTHER) as gateway:
         until(lambda: gateway.gateway.hub.taken > 0)
         for right, look, acts in TABLE[serve, address]:
@@ -141,9 +139,7 @@ def test_a_token_is_ignored_if_no_token_file_is_configured(tmp_path: Path) -> No
         assert gateway.post(WRITE[0], {**WRITE[1], "seen": 1}, authorization="Bearer any").status == 401
 
 
-def test_a_wrong_token_is_logged_once_although_it_is_repeated(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_repeated_wrong_token_is_logged_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with served(tmp_path) as gateway:
         for _ in range(3):
             assert gateway.get("/api/plant", cookie="multidrop=taken-away").status == 401
@@ -201,9 +197,7 @@ ORIGINS = {
 
 
 @table("case", ORIGINS)
-def test_an_origin_header_is_accepted_only_if_it_is_the_gateways_own_page(
-    case: tuple[str, str, tuple[str, ...]],
-) -> None:
+def test_only_the_gateways_own_page_may_be_the_origin(case: tuple[str, str, tuple[str, ...]]) -> None:
     origin, host, schemes = case
     names = OwnNames(["plant.example"], "0.0.0.0", 443)
     assert names.has_origin(origin, host, schemes) is ORIGINS[case]
@@ -233,9 +227,7 @@ def test_request_with_two_host_headers_is_refused(open_gateway: Served) -> None:
 
 
 @pytest.mark.parametrize("path", ["/", "/api/plant", "/api/nothing", "/metrics", "/api/stop"])
-def test_each_answer_forbids_framing_by_other_sites_and_guessing_of_its_type(
-    open_gateway: Served, path: str
-) -> None:
+def test_answers_forbid_framing_and_guessing_of_their_type(open_gateway: Served, path: str) -> None:
     headers = open_gateway.get(path).headers
     if path == "/":
         policy = "default-src 'self'; base-uri 'none'; form-action 'none'; object-src 'none'"

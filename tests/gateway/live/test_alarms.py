@@ -118,9 +118,7 @@ def test_an_unknown_state_has_a_reason_and_a_new_yd1000_fault_record_is_a_fault(
         ("delixi-native", ("status",), True),
     ],
 )
-def test_ability_to_show_a_fault_depends_on_the_polled_registers(
-    model: str, polled: tuple[str, ...], is_seen: bool
-) -> None:
+def test_polled_registers_decide_if_faults_show(model: str, polled: tuple[str, ...], is_seen: bool) -> None:
     assert can_show_fault(MODELS[model](1), polled) is is_seen
 
 
@@ -323,9 +321,7 @@ def faults(gateway: Served) -> list[Any]:
     return [one for one in gateway.frame()["alarms"] if one["kind"] == "fault"]
 
 
-def test_alarms_are_logged_and_acknowledged_and_survive_a_restart(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_acknowledged_alarms_survive_a_restart(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "multidrop.gateway")
     words = "overcurrent while accelerating (OC1)"
     with served(tmp_path) as gateway:
@@ -441,9 +437,7 @@ BELOW = Limit("pump", "pressure", "bar", False, 1.0, hysteresis=0.5)
         ([30] * 7, [False] * 7),  # equal to the limit is not above it
     ],
 )
-def test_an_alarm_limit_has_a_duration_and_a_hysteresis(
-    values: list[float | None], beyond: list[bool]
-) -> None:
+def test_a_limit_has_duration_and_hysteresis(values: list[float | None], beyond: list[bool]) -> None:
     limits, text, seen = Limits([ABOVE]), "", []
     for second, value in enumerate(values):
         text = limits.exceeded(second, "pump", {} if value is None else {"current": value}, text)

@@ -77,9 +77,7 @@ async def test_changes_between_two_page_frames_are_computed_once_for_all_viewers
     assert compared == [1]
 
 
-async def test_at_most_five_page_frames_are_made_per_second(
-    frames: Frames, clock: Clock, made: list[int]
-) -> None:
+async def test_at_most_five_frames_are_made_per_second(frames: Frames, clock: Clock, made: list[int]) -> None:
     seen = -1
     for _ in range(1000):  # 10 s with a change every 10 ms
         clock.now += 0.01
@@ -95,9 +93,7 @@ async def test_at_most_five_page_frames_are_made_per_second(
     assert 45 <= len(made) <= 51
 
 
-async def test_rows_that_arrive_too_soon_for_a_page_frame_appear_in_the_next(
-    frames: Frames, clock: Clock
-) -> None:
+async def test_rows_too_early_for_a_frame_appear_in_the_next(frames: Frames, clock: Clock) -> None:
     """The next page frame is made even if no further rows arrive."""
     first = await frames.after(-1)
     assert first is not None
@@ -158,9 +154,7 @@ plants = st.fixed_dictionaries(
 
 
 @given(plants, plants)
-def test_changes_applied_to_the_old_page_frame_give_the_new_page_frame(
-    before: dict[str, Any], now: dict[str, Any]
-) -> None:
+def test_changes_to_the_old_frame_give_the_new_one(before: dict[str, Any], now: dict[str, Any]) -> None:
     said = changes(before, now)
     assert merged(before, said) == now
     assert changes(before, merged(before, said)) == said
@@ -198,9 +192,7 @@ async def view(pictures: list[tuple[dict[str, Any], int]], begin: int) -> None:
 
 @pytest.mark.slow
 @given(st.lists(st.tuples(plants, st.integers(0, 9)), min_size=2, max_size=12), st.integers(0, 2**32))
-def test_a_viewer_that_skips_page_frames_has_the_data_of_the_newest(
-    pictures: list[tuple[dict[str, Any], int]], begin: int
-) -> None:
+def test_a_viewer_may_skip_frames(pictures: list[tuple[dict[str, Any], int]], begin: int) -> None:
     """The frames' revision number changes in the middle of the run."""
     asyncio.run(view(pictures, begin))
 
@@ -239,9 +231,7 @@ async def test_too_many_viewers_get_an_error(frames: Frames, monkeypatch: pytest
     assert json.loads(sent[1]["body"]) == {"error": "too many viewers; the limit is 0"}
 
 
-def test_a_page_frame_is_made_after_the_alarm_check_of_the_same_rows(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_frames_are_made_after_the_alarm_check(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """At most every 0.2 s, the gateway checks drives for alarms and then makes a page frame."""
     gateway = Gateway(written(tmp_path), ServeSettings(port=0))
     gateway.listener.close()

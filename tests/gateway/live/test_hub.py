@@ -122,9 +122,7 @@ def test_a_failed_read_does_not_replace_the_last_good_row(hub: Hub) -> None:
     ("status", "frequency", "state"),
     [(FORWARD, 25, "runs"), (FORWARD, 0, "runs"), (STANDBY, 0, "stands"), (2, 25, "runs"), (9, 0, "unknown")],
 )
-def test_state_of_a_drive_follows_from_its_status_register(
-    hub: Hub, status: int, frequency: int, state: str
-) -> None:
+def test_a_status_register_gives_the_state(hub: Hub, status: int, frequency: int, state: str) -> None:
     hub.take(all_of(10, status, frequency))
     assert hub.state("pump-1") == state
     assert hub.seen("pump-1").fault is None
@@ -239,9 +237,7 @@ def test_values_of_a_slowly_polled_register_stay_fresh_longer(tmp_path: Path, cl
 
 
 @pytest.mark.slow
-def test_values_of_an_overloaded_line_stay_fresh_for_three_polling_cycles(
-    tmp_path: Path, clock: HubClock
-) -> None:
+def test_values_of_an_overloaded_line_stay_fresh_for_three_cycles(tmp_path: Path, clock: HubClock) -> None:
     path = written(tmp_path, "", *(f"pump-{n}" for n in range(1, 31))).path
     path.write_text(path.read_text().replace("baudrate = 38400", "baudrate = 1200"))
     hub = Hub(Plant.load(path), clock)
@@ -327,9 +323,7 @@ def test_each_alarm_starts_and_ends_once(shown: list[Shown]) -> None:
 
 
 @pytest.mark.parametrize(("status", "is_over"), [(STANDBY, True), (9, True), (TRIPPED, False)])
-def test_fault_stays_while_some_values_of_its_drive_are_unknown(
-    hub: Hub, clock: HubClock, status: int, is_over: bool
-) -> None:
+def test_a_fault_outlasts_unknown_values(hub: Hub, clock: HubClock, status: int, is_over: bool) -> None:
     """A busy line may read other registers but not the status for a second. The fault may still be active."""
     events = Alarms()
 

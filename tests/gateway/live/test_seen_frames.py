@@ -154,9 +154,7 @@ def commands(gateway: Served) -> list[tuple[str, float]]:
 
 
 @pytest.mark.parametrize(("path", "body"), [("/api/act", START), ("/api/write", WRITE)])
-def test_a_command_delayed_by_the_network_is_not_sent(
-    tmp_path: Path, path: str, body: dict[str, object]
-) -> None:
+def test_a_delayed_command_is_not_sent(tmp_path: Path, path: str, body: dict[str, object]) -> None:
     with served(tmp_path, MAY) as gateway:
         seen = gateway.frame_number()
         with held_up(gateway, path, {**body, "seen": seen}) as client:
@@ -222,9 +220,7 @@ def test_a_command_that_waited_too_long_for_its_thread_is_not_sent(tmp_path: Pat
         assert commands(gateway) == []
 
 
-def test_a_stop_called_just_before_a_start_is_sent_prevents_the_start(
-    gateway: Served, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stop_right_before_a_start_prevents_it(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     act, before = commands_module.carry_out_verb, commands(gateway)
 
     def act_after_a_stop(drive: Drive, **given: Any) -> CommandResult:
@@ -250,9 +246,7 @@ def test_a_page_frame_number_of_a_previous_process_is_refused(tmp_path: Path) ->
 
 
 @table("wrong", [{}, {"seen": None}, {"seen": "7"}, {"seen": True}, {"seen": 1.5}, {"seen": 10**300}])
-def test_writes_and_verbs_without_a_page_frame_number_are_refused(
-    gateway: Served, wrong: dict[str, Any]
-) -> None:
+def test_commands_without_a_frame_number_are_refused(gateway: Served, wrong: dict[str, Any]) -> None:
     before, called = commands(gateway), gateway.gateway.commands.called
     writer = {"authorization": gateway.bearer(Right.WRITE)}
     verbs = {"start": {}, "jog": {}, "reset_fault": {}, "set_frequency": {"hz": 20.0}}

@@ -154,9 +154,7 @@ def test_values_of_a_silent_drive_are_marked_as_old(gateway: Served) -> None:
 
 
 @pytest.mark.long
-def test_unpolled_registers_are_read_while_a_drive_is_viewed(
-    gateway: Served, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unpolled_registers_are_read_for_viewers(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(drive_reads, "PAUSE_S", 0.0)
     monkeypatch.setattr(drive_reads, "SHARE", 0)
     gateway.sims["pump-1"]["dc_bus_voltage"] = 537.0
@@ -290,9 +288,7 @@ def recent(tmp_path: Path) -> RecentStatistics:
 
 
 @pytest.mark.slow
-def test_the_last_hour_has_statistics_of_60_minutes_from_few_stored_readings(
-    recent: RecentStatistics,
-) -> None:
+def test_the_last_hour_has_60_minutes_of_statistics(recent: RecentStatistics) -> None:
     alive: list[weakref.ref[LineStatistics]] = []
     for second in range(0, 70 * 60 + 31, 5):
         found = reading(second)
@@ -318,9 +314,7 @@ def test_statistics_of_a_line_cover_the_last_seconds(recent: RecentStatistics) -
     assert recent.line("roof")["rate"] is None
 
 
-def test_statistics_of_a_line_without_replies_are_none_instead_of_zero(
-    recent: RecentStatistics, tmp_path: Path
-) -> None:
+def test_statistics_of_a_line_without_replies_are_none(recent: RecentStatistics, tmp_path: Path) -> None:
     assert recent.line("hall")["misses"] is None
     for second in range(100):
         # statistics without any reply
@@ -356,9 +350,7 @@ MAY_STOP = '[serve.may]\nstop = "anyone"\n'
 
 
 @pytest.mark.long
-def test_a_stop_does_not_read_an_identity_that_is_known(
-    tmp_path: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stop_reads_no_known_identity(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """No identity is read between the call of the stop and the Modbus request that stops the drive."""
     asked: list[str] = []
     with served(tmp_path, MAY_STOP) as gateway:
@@ -433,9 +425,7 @@ def test_known_identity_is_not_read_again() -> None:
 
 
 @pytest.mark.usefixtures("_at_once")
-def test_a_wrong_identity_is_logged_once_and_failures_do_not_end_the_checks(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_a_wrong_identity_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
     stranger = WriteForbidden(
         "nothing is written to fan-1, so it is not a CHE", rule="it does not look like its family"
     )
@@ -457,9 +447,7 @@ def parameter_state(gateway: Served) -> str:
     return str(gateway.get(PARAMETERS).json["state"])
 
 
-def test_drive_parameters_are_read_on_request_and_exported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_parameters_are_read_on_request_and_exported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     space = ParameterSpace(groups=(ParameterGroup("P.", 0x2000, range(3)),))
     monkeypatch.setattr(InvtCHE, "parameter_space", space)
     parameters._parameters_of.cache_clear()

@@ -192,9 +192,7 @@ def get(gateway: Any, path: str) -> Any:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("passing", ["declared", "off"])
-def test_a_client_that_follows_the_address_map_reads_the_values_of_the_web_page(
-    tmp_path: Path, passing: str
-) -> None:
+def test_values_read_by_the_address_map_equal_those_of_the_web_page(tmp_path: Path, passing: str) -> None:
     with served(tmp_path, passing) as gateway, closing(Client()) as client:
         rows = get(gateway, "/api/modbus-map")
         until(lambda: None not in [one[0] for drive in values(gateway).values() for one in drive.values()])
@@ -256,9 +254,7 @@ def test_clients_can_write_only_the_rows_that_the_address_map_marks_writable(tmp
 
 
 @pytest.mark.slow
-def test_http_and_the_command_line_give_the_same_address_map(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_http_and_cli_give_the_same_address_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with served(tmp_path, "declared") as gateway:
         rows = get(gateway, "/api/modbus-map")
         listed = [*csv.DictReader(io.StringIO(get(gateway, "/api/modbus-map?format=csv")))]
@@ -298,9 +294,7 @@ def test_rows_of_the_json_address_map_are_encoded_one_by_one(monkeypatch: pytest
     assert encoded == [row._asdict()] * 3
 
 
-def test_a_plant_without_a_modbus_server_has_no_address_map(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_a_server_there_is_no_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(
         '[[line]]\nname = "a"\nport = "/dev/a"\n[[line.drive]]\nname = "b"\naddress = 1\nmodel = "yd1000"\n'

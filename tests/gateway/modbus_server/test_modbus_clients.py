@@ -97,9 +97,7 @@ async def test_answers_have_the_ids_of_their_requests_and_are_sent_when_ready() 
     assert [transport.written[at + 8] for at in (0, 9, 18)] == [1, 2, 3]
 
 
-async def test_an_internal_failure_is_answered_with_a_modbus_exception(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+async def test_an_internal_error_is_answered_with_an_exception(caplog: pytest.LogCaptureFixture) -> None:
     async def fails(found: MbapRequest) -> bytes:
         raise RuntimeError("a mistake of ours")
 
@@ -258,9 +256,7 @@ def test_number_of_requests_of_a_client_that_reads_no_answers_is_limited(
     assert caplog.text.count("does not read its answers") == 1
 
 
-async def test_requests_beyond_the_limit_of_waiting_requests_are_answered_busy(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+async def test_requests_beyond_the_queue_limit_are_answered_busy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(modbus_clients, "MOST_BEHIND", 1000 * READ_SIZE)
     client, transport = connected(port_of())
     client.data_received(reads(0, 1002))

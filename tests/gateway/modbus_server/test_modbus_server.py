@@ -179,9 +179,7 @@ def test_read_of_126_words_is_refused(gateway: Gateway) -> None:
 
 @table("function", [1, 3, 5, 6])
 @table("data", [b"", b"\0", b"\0\0\0", b"\0\0\0\1\0"])
-def test_a_request_of_a_wrong_length_is_answered_as_an_illegal_value(
-    gateway: Gateway, function: int, data: bytes
-) -> None:
+def test_a_request_of_wrong_length_is_an_illegal_value(gateway: Gateway, function: int, data: bytes) -> None:
     assert code(gateway, 1, function, data=data) == 3
 
 
@@ -228,9 +226,7 @@ FAILURES = [
 
 
 @pytest.mark.parametrize(("failure", "expected"), FAILURES, ids=lambda one: type(one).__name__)
-def test_a_failed_read_from_a_drive_is_answered_with_the_exception_of_its_error(
-    gateway: Gateway, failure: Exception, expected: int
-) -> None:
+def test_a_failed_read_has_its_exception_code(gateway: Gateway, failure: Exception, expected: int) -> None:
     gateway.hub.values.clear()
     gateway.line.failure = failure
     assert code(gateway, 1, 3, CHE_OUTPUT_VOLTAGE, 1) == expected
@@ -318,9 +314,7 @@ OUTCOMES = [
 
 
 @pytest.mark.parametrize(("failure", "expected"), OUTCOMES, ids=lambda one: str(one)[:40])
-def test_each_result_of_a_write_has_its_modbus_exception(
-    gateway: Gateway, failure: Any, expected: int
-) -> None:
+def test_each_failed_write_has_its_exception_code(gateway: Gateway, failure: Any, expected: int) -> None:
     gateway.commands.told = CommandResult(CommandOutcome.FAILED, str(failure), failure)
     assert code(gateway, 1, 6, CHE_SETPOINT, 5000) == expected
 
@@ -446,9 +440,7 @@ def test_of_a_write_of_several_coils_only_the_stop_is_sent() -> None:
 
 
 @table(("address", "words"), [(CHE_CONTROL, (1, 5)), (CHE_CONTROL - 1, (5, 1)), (CHE_SETPOINT, (5, 5))])
-def test_a_write_of_several_words_without_a_stop_is_refused(
-    gateway: Gateway, address: int, words: tuple[int, ...]
-) -> None:
+def test_writes_without_a_stop_are_refused(gateway: Gateway, address: int, words: tuple[int, ...]) -> None:
     data = struct.pack(f">B{len(words)}H", 2 * len(words), *words)
     assert code(gateway, 1, 16, address, len(words), data=data) in (2, 3)
     assert (gateway.commands.written, gateway.commands.stopped) == ([], [])
@@ -477,9 +469,7 @@ class HeldCommands:
 
 
 @pytest.mark.parametrize("is_disconnected", [False, True])
-def test_a_slow_stop_is_answered_with_acknowledge_and_continues(
-    gateway: Gateway, is_disconnected: bool
-) -> None:
+def test_a_slow_stop_is_acknowledged_and_continues(gateway: Gateway, is_disconnected: bool) -> None:
     held = HeldCommands(gateway)
     with gateway.client() as client:
         client.send(request(1, 1, 6, CHE_CONTROL, 5))
@@ -525,16 +515,12 @@ def test_number_of_concurrent_stops_is_limited_and_each_request_is_answered(gate
     ("failure", "expected"),
     [(BusError("not seen to stand"), 0x0B), (NoReply("mill"), 0x0B), (PortLost("/dev/x", "gone"), 0x0A)],
 )
-def test_a_failed_stop_is_answered_with_an_exception_code(
-    gateway: Gateway, failure: BusError, expected: int
-) -> None:
+def test_a_failed_stop_has_an_exception_code(gateway: Gateway, failure: BusError, expected: int) -> None:
     gateway.commands.told = CommandResult(CommandOutcome.FAILED, str(failure), failure)
     assert code(gateway, 1, 6, CHE_CONTROL, 5) == expected
 
 
-def test_an_unexpected_error_of_a_stop_is_logged_and_answered(
-    gateway: Gateway, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_stops_unexpected_error_is_logged(gateway: Gateway, caplog: pytest.LogCaptureFixture) -> None:
     async def fails() -> CommandResult:
         raise RuntimeError("a mistake of ours")
 
@@ -543,9 +529,7 @@ def test_an_unexpected_error_of_a_stop_is_logged_and_answered(
     assert "a mistake of ours" in caplog.text
 
 
-def test_a_drives_reply_of_a_wrong_length_is_answered_as_no_reply(
-    gateway: Gateway, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_reply_of_a_wrong_length_is_no_reply(gateway: Gateway, monkeypatch: pytest.MonkeyPatch) -> None:
     async def short(*request: object) -> list[int]:
         return [1]
 
@@ -597,9 +581,7 @@ def test_unknown_values_in_the_common_register_block_read_as_reserved_numbers(ga
     assert 69_990 <= found[8] << 16 | found[9] < 80_000
 
 
-def test_values_from_before_a_sleep_are_unknown_in_the_common_register_block(
-    gateway: Gateway,
-) -> None:
+def test_values_from_before_a_sleep_are_unknown_in_the_common_register_block(gateway: Gateway) -> None:
     gateway.hub.values["mill", "output_frequency"] = 49.99
     gateway.hub.woken_ns = time.monotonic_ns() + 3600 * 10**9
     found = block(gateway)
@@ -608,9 +590,7 @@ def test_values_from_before_a_sleep_are_unknown_in_the_common_register_block(
 
 
 @table(("number", "expected"), [(5.0, 5), (None, 0xFFFE), (0.0, 0xFFFE)])
-def test_the_common_register_block_has_the_fault_number_of_the_drives_family(
-    gateway: Gateway, number: float | None, expected: int
-) -> None:
+def test_the_common_block_has_the_fault_number(gateway: Gateway, number: float | None, expected: int) -> None:
     gateway.hub.states["mill"] = "fault"
     gateway.hub.values["mill", "fault"] = number
     assert block(gateway)[:2] == [3, expected]

@@ -147,9 +147,7 @@ def test_a_modbus_tool_reads_the_drives_and_cannot_write_by_default(name: str, t
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", usually(*TOOLS))
-def test_a_modbus_tool_with_the_right_to_write_can_stop_but_not_start_a_drive(
-    name: str, tmp_path: Path
-) -> None:
+def test_a_tool_that_may_write_can_stop_but_not_start_a_drive(name: str, tmp_path: Path) -> None:
     with connected(name, tmp_path, SERVE.replace("[serve.tool]", '[serve.tool]\nmay = "write"')) as (
         gateway,
         tool,

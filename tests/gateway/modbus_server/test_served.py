@@ -147,9 +147,7 @@ def test_mistakes_in_the_table_serve_modbus_are_reported_with_their_place(tmp_pa
         ({"common": 0xFFF8}, "is not an address"),
     ],
 )
-def test_each_mistake_in_the_modbus_settings_is_reported_in_one_sentence(
-    settings: dict[str, object], sentence: str
-) -> None:
+def test_each_modbus_setting_mistake_is_one_sentence(settings: dict[str, object], sentence: str) -> None:
     with pytest.raises(ValueError, match=r"^[\w\"]+") as mistake:
         ModbusSettings(**settings)  # type: ignore[arg-type]
     assert sentence in str(mistake.value)
@@ -343,9 +341,7 @@ def test_no_family_has_registers_in_the_address_range_of_the_common_register_blo
         ("delta-ms300", "control", 1),
     ],
 )
-def test_the_modbus_server_knows_the_writes_that_stop_a_drive_of_each_family(
-    model: str, register: str, raw: int
-) -> None:
+def test_the_values_that_stop_each_family_are_known(model: str, register: str, raw: int) -> None:
     unit = Unit("hall", PolledDrive(find_model(model)(1), ()))
     assert StopWrite(register, raw) in unit.stops
 

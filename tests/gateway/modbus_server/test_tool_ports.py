@@ -291,9 +291,7 @@ def test_a_port_for_modbus_tools_refuses_and_records_each_write_by_default(tmp_p
         assert len(rig.commands.refused) < 6  # at most one record a second
 
 
-def test_a_modbus_tool_with_the_right_to_write_may_set_and_stop_but_not_start_drives(
-    rig: Rig, tool: int
-) -> None:
+def test_a_tool_that_may_write_can_set_and_stop_but_not_start_drives(rig: Rig, tool: int) -> None:
     assert code(tool, f"01 06 {SETPOINT:04X} 1388") is None
     drive, register, value, caller = rig.commands.written[0]
     assert (drive, register, value) == ("mill", "setpoint", 50.0)
@@ -367,9 +365,7 @@ def test_eight_modbus_tools_on_tcp_are_served_and_a_ninth_is_refused(rig: Rig) -
             tool.close()
 
 
-def test_a_connection_that_failed_to_be_accepted_is_accepted_later(
-    rig: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_connection_is_accepted_after_a_failed_attempt(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     failures: list[None] = []
 
     def accept() -> Any:
@@ -432,9 +428,7 @@ def test_a_symlink_is_replaced_only_if_a_killed_gateway_made_it(tmp_path: Path) 
         ('pty = { hall = "p" }\nbaud = 9600', "baud"),
     ],
 )
-def test_each_mistake_in_the_tool_port_settings_is_reported_in_one_sentence(
-    text: str, sentence: str, tmp_path: Path
-) -> None:
+def test_each_tool_port_mistake_is_one_sentence(text: str, sentence: str, tmp_path: Path) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(f"[serve.tool]\n{text}\n" + LINES)
     with pytest.raises(PlantError) as wrong:

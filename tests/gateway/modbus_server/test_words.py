@@ -87,9 +87,7 @@ def sent(draw: st.DrawFn) -> tuple[NumberFormat, str, float, float, bytes]:
 # lost in the sum with the offset of 1000
 @example((NumberFormat.F64, "ABCD", 1, 1000, struct.pack(">d", 1e-20)))
 @example((NumberFormat.F32, "ABCD", 1, 273.15, struct.pack(">f", 1e-20)))
-def test_words_computed_from_a_value_are_the_drives_words_or_unknown(
-    case: tuple[NumberFormat, str, float, float, bytes],
-) -> None:
+def test_words_of_a_value_are_right_or_unknown(case: tuple[NumberFormat, str, float, float, bytes]) -> None:
     number_format, order, step, offset, data = case
     register = declared(number_format=number_format, order=order, step=step, offset=offset)
     value = value_of(register, data)

@@ -57,9 +57,7 @@ def now_on_both_clocks() -> tuple[int, int]:
             return utc_ms, boot_ns
 
 
-def test_the_newest_values_are_published_as_retained_messages(
-    broker: Broker, listener: Listener, start: Start
-) -> None:
+def test_the_newest_values_are_retained(broker: Broker, listener: Listener, start: Start) -> None:
     start()
     listener.wait_for(has("multidrop/gateway", b"online"))
     listener.wait_for(has(f"multidrop/{FAN.name}/available", b"online"))
@@ -75,9 +73,7 @@ def test_the_newest_values_are_published_as_retained_messages(
     }
 
 
-def test_a_stale_value_is_published_as_null_and_a_silent_drive_as_offline(
-    listener: Listener, start: Start
-) -> None:
+def test_stale_values_are_null_and_silent_drives_offline(listener: Listener, start: Start) -> None:
     known, running = start()
     listener.wait_for(has("multidrop/pump-1/available", b"online"))
     known.hub.values[("pump-1", "output_frequency")] = None
@@ -140,9 +136,7 @@ def test_closing_the_gateway_publishes_offline(broker: Broker, listener: Listene
         listener.wait_for(has(f"multidrop/{drive}/available", b"offline"))
 
 
-def test_a_gateway_that_fails_to_publish_is_offline_and_still_carries_out_stops(
-    broker: Broker, listener: Listener, start: Start
-) -> None:
+def test_a_failing_publisher_is_offline_and_stops(broker: Broker, listener: Listener, start: Start) -> None:
     """Without "offline", the values that the broker retains would look current."""
     known, running = start(commands=True)
     listener.wait_for(has("multidrop/gateway", b"online"))
@@ -164,9 +158,7 @@ def test_a_gateway_that_fails_to_publish_is_offline_and_still_carries_out_stops(
 
 
 @pytest.mark.slow
-def test_a_gateway_that_fails_to_publish_is_offline_after_a_reconnection_too(
-    listener: Listener, start: Start
-) -> None:
+def test_a_failing_publisher_is_offline_after_a_reconnection_too(listener: Listener, start: Start) -> None:
     known, running = start()
     listener.wait_for(has("multidrop/gateway", b"online"))
     state = known.hub.states.pop("pump-1")
@@ -204,9 +196,7 @@ def test_publishing_does_not_wait_for_a_frozen_broker(
 
 
 @pytest.mark.slow
-def test_all_messages_are_published_again_to_a_restarted_broker(
-    broker: Broker, listener: Listener, start: Start
-) -> None:
+def test_a_restarted_broker_gets_all_messages(broker: Broker, listener: Listener, start: Start) -> None:
     start()
     listener.wait_for(has("multidrop/gateway", b"online"))
     broker.kill()
@@ -236,9 +226,7 @@ def write_of(value: object, time_ms: int, **more: object) -> bytes:
     return json.dumps({"value": value, "time": time_ms, **more}).encode()
 
 
-def test_a_recent_write_is_carried_out_once_and_its_copy_is_refused(
-    broker: Broker, listener: Listener, commanded: Any
-) -> None:
+def test_a_recent_write_is_carried_out_once(broker: Broker, listener: Listener, commanded: Any) -> None:
     fresh = write_of(25, now_ms(), id="order-7")
     publish(broker, "multidrop/pump-1/set/setpoint", fresh)
     assert told(listener) == {"what": "setpoint = 25", "done": True, "text": "done", "id": "order-7"}
@@ -270,9 +258,7 @@ def test_a_retained_command_is_refused(broker: Broker, listener: Listener, start
 
 
 @pytest.mark.slow
-def test_a_stop_is_carried_out_even_if_retained_or_for_all_drives(
-    broker: Broker, listener: Listener, start: Start
-) -> None:
+def test_a_retained_stop_for_all_is_carried_out(broker: Broker, listener: Listener, start: Start) -> None:
     publish(broker, "multidrop/pump-1/stop", b"stop", "-r")
     known, _ = start(commands=True)
     assert told(listener)["what"] == "stop"
@@ -373,9 +359,7 @@ async def test_a_stop_verb_finds_drives_by_another_unicode_spelling(
     assert known.commands.noted == [("act", drive, "coast", {}) for drive in stopped]
 
 
-def test_a_verb_for_another_drive_or_an_unknown_verb_is_refused(
-    broker: Broker, listener: Listener, commanded: Any
-) -> None:
+def test_an_unknown_verb_is_refused(broker: Broker, listener: Listener, commanded: Any) -> None:
     order = {"verb": "start", "drive": FAN.name, "time": now_ms()}
     publish(broker, "multidrop/pump-1/act", json.dumps(order).encode())
     assert f"the message names drive '{FAN.name}'" in told(listener)["text"]
@@ -384,9 +368,7 @@ def test_a_verb_for_another_drive_or_an_unknown_verb_is_refused(
     assert commanded.commands.noted == []
 
 
-def test_a_command_sent_before_a_reload_is_refused(
-    broker: Broker, listener: Listener, commanded: Any
-) -> None:
+def test_a_command_before_a_reload_is_refused(broker: Broker, listener: Listener, commanded: Any) -> None:
     """After a reload, the drive's name may mean another drive."""
     for after_ms, text in ((1900, "not sent: it may have been sent before the plant"), (2500, "done")):
         sent_ms, sent_ns = now_on_both_clocks()
@@ -416,9 +398,7 @@ def test_a_command_sent_before_a_stop_is_refused(
     assert len(commanded.commands.noted) == (3 if is_taken else 1)
 
 
-def test_a_verb_whose_payload_names_another_drive_than_its_topic_is_refused(
-    broker: Broker, listener: Listener, commanded: Any
-) -> None:
+def test_a_payload_for_another_drive_is_refused(broker: Broker, listener: Listener, commanded: Any) -> None:
     act = {"verb": "start", "drive": "pump-1", "options": {"direction": "forward"}, "time": now_ms()}
     publish(broker, f"multidrop/{FAN.name}/act", json.dumps(act).encode())
     assert "the message names drive 'pump-1'" in told(listener, FAN.name)["text"]
@@ -478,9 +458,7 @@ def test_an_infinite_value_is_published_as_null(listener: Listener, start: Start
     assert b'"output_frequency": null' in said.payload
 
 
-def test_command_topics_are_not_subscribed_unless_commands_are_enabled(
-    broker: Broker, listener: Listener, start: Start
-) -> None:
+def test_commands_are_not_subscribed_by_default(broker: Broker, listener: Listener, start: Start) -> None:
     known, running = start()
     listener.wait_for(has("multidrop/gateway", b"online"))
     publish(broker, "multidrop/stop", b"stop", "-q", "1")
@@ -501,9 +479,7 @@ def test_without_commands_the_only_command_topic_is_that_of_the_sparkplug_node(t
 
 
 @pytest.mark.parametrize("is_retained", [False, True])
-async def test_received_commands_are_ignored_unless_commands_are_enabled(
-    tmp_path: Path, is_retained: bool
-) -> None:
+async def test_commands_are_ignored_unless_enabled(tmp_path: Path, is_retained: bool) -> None:
     """A broker may send messages of topics to which the gateway has not subscribed."""
     require_module("paho.mqtt.client")
     known = inside(tmp_path)
@@ -544,9 +520,7 @@ def test_home_assistant_discovers_each_drive(broker: Broker, listener: Listener,
     assert parts["setpoint_set"]["command_topic"] == "multidrop/pump-1/set/setpoint"
 
 
-def test_a_write_made_by_the_home_assistant_template_is_carried_out(
-    broker: Broker, listener: Listener, start: Start
-) -> None:
+def test_the_home_assistant_template_can_write(broker: Broker, listener: Listener, start: Start) -> None:
     jinja2 = require_module("jinja2")
     known, _ = start(home_assistant=True, commands=True)
     said = listener.wait_for(has("homeassistant/device/multidrop-pump-1/config"))
@@ -688,9 +662,7 @@ def test_a_home_assistant_number_of_an_unpolled_register_has_no_state() -> None:
         ("silent", "None", "None"),
     ],
 )
-def test_home_assistant_binary_sensors_follow_the_state_of_the_drive(
-    state: str, problem: str, running: str
-) -> None:
+def test_home_assistant_sensors_follow_the_drives_state(state: str, problem: str, running: str) -> None:
     parts = configured(InvtCHE(1, name="a"), [], [])["cmps"]
     assert [rendered(parts[key], {"state": state}) for key in ("problem", "running")] == [problem, running]
     assert rendered(parts["state"], {"state": state}) in parts["state"]["options"]
@@ -850,9 +822,7 @@ def test_topics_of_a_drive_removed_without_a_connection_are_deleted_later(tmp_pa
 
 
 @pytest.mark.parametrize("is_known", [True, False])
-def test_no_topic_is_deleted_before_the_gateway_of_a_fleet_knows_its_lines(
-    tmp_path: Path, is_known: bool
-) -> None:
+def test_no_topic_is_deleted_before_a_fleet_knows_its_lines(tmp_path: Path, is_known: bool) -> None:
     known = inside(tmp_path)
     plant = known.plant if is_known else replace(known.plant, lines=())
     topics = JsonTopics(MqttSettings(), known._replace(plant=plant), now_ms)
@@ -862,9 +832,7 @@ def test_no_topic_is_deleted_before_the_gateway_of_a_fleet_knows_its_lines(
     assert bool(topics.outbox.emptied()) is is_known
 
 
-def test_retained_messages_of_a_drive_removed_by_a_reload_are_deleted(
-    broker: Broker, listener: Listener, start: Start
-) -> None:
+def test_topics_of_removed_drives_are_deleted(broker: Broker, listener: Listener, start: Start) -> None:
     known, running = start(home_assistant=True)
     fan = f"multidrop/{FAN.name}"
     topics = [fan, f"{fan}/available", discovery_topic("multidrop", FAN.name)]

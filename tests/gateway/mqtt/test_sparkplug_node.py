@@ -75,9 +75,7 @@ def test_the_text_of_a_fault_is_published_without_a_polled_fault_register(tmp_pa
 
 
 @pytest.mark.parametrize("family", [VfdEl, InvtCHE, DelixiModbus])
-def test_a_register_named_fault_gets_a_metric_besides_the_metric_fault(
-    tmp_path: Path, family: type[Drive]
-) -> None:
+def test_a_register_named_fault_does_not_hide_the_fault_metric(tmp_path: Path, family: type[Drive]) -> None:
     """The metric `fault` is the text of a fault. The register's metric has the type of the register."""
     known = inside(tmp_path, family(2, name="mill"))
     known.hub.states["mill"], known.hub.faults["mill"] = "fault", "it shows a fault"
@@ -134,9 +132,7 @@ def test_sequence_numbers_of_messages_restart_at_0_after_255(host: Host, node: t
     assert host.seq < 256
 
 
-def test_a_rebirth_command_makes_the_node_send_all_births_again(
-    broker: Broker, host: Host, node: tuple[Any, Running]
-) -> None:
+def test_a_rebirth_command_repeats_all_births(broker: Broker, host: Host, node: tuple[Any, Running]) -> None:
     host.wait_for("DBIRTH", FAN.name)
     command(broker, ROOT.format("NCMD"), name="Node Control/Rebirth", boolean_value=True, datatype=11)
     assert host.values(host.wait_for("NBIRTH"))["bdSeq"] == 0
@@ -145,9 +141,7 @@ def test_a_rebirth_command_makes_the_node_send_all_births_again(
 
 
 @pytest.mark.slow
-def test_a_lost_connection_sends_a_death_and_a_birth_with_the_next_bdseq(
-    host: Host, node: tuple[Any, Running]
-) -> None:
+def test_a_new_connection_has_the_next_bdseq(host: Host, node: tuple[Any, Running]) -> None:
     host.wait_for("DBIRTH", FAN.name)
     node[1].cut(1)
     assert host.values(host.wait_for("NDEATH")) == {"bdSeq": 0}
@@ -195,9 +189,7 @@ def test_closing_the_gateway_sends_a_death(broker: Broker, host: Host, tmp_path:
     assert host.values(host.wait_for("NDEATH")) == {"bdSeq": 0}
 
 
-def test_a_recent_write_and_any_stop_of_a_host_are_carried_out(
-    broker: Broker, host: Host, node: tuple[Any, Running]
-) -> None:
+def test_recent_writes_and_any_stop_are_sent(broker: Broker, host: Host, node: tuple[Any, Running]) -> None:
     known, _ = node
     host.wait_for("DBIRTH", "pump-1")
     alias = {name: number for number, name in host.aliases.items()}["setpoint"]
@@ -232,9 +224,7 @@ async def test_a_stop_in_an_invalid_payload_is_carried_out(
 
 
 @pytest.mark.parametrize("is_retained", [False, True])
-async def test_a_retained_write_is_refused_and_a_retained_stop_is_carried_out(
-    tmp_path: Path, *, is_retained: bool
-) -> None:
+async def test_a_retained_message_can_stop_but_not_write(tmp_path: Path, *, is_retained: bool) -> None:
     """A broker sends a retained write at each connection, so even a recent one is refused."""
     known = inside(tmp_path)
     node = SparkplugNode(MqttSettings(sparkplug="works", node="line", commands=True), known, lambda: 1_000)
@@ -246,9 +236,7 @@ async def test_a_retained_write_is_refused_and_a_retained_stop_is_carried_out(
     assert known.commands.noted == [*written, ("stop", ["pump-1"])]
 
 
-def test_a_reload_sends_deaths_of_removed_drives_and_births_of_all_others(
-    broker: Broker, host: Host, node: tuple[Any, Running]
-) -> None:
+def test_a_reload_sends_deaths_and_births(broker: Broker, host: Host, node: tuple[Any, Running]) -> None:
     known, running = node
     host.wait_for("DBIRTH", FAN.name)
     running.adopt(without_fan(known))
@@ -401,9 +389,7 @@ def test_a_failed_start_of_the_mqtt_part_leaves_no_spool_open(tmp_path: Path) ->
 
 
 @pytest.mark.slow
-def test_rows_polled_while_the_broker_was_away_are_sent_as_historical(
-    broker: Broker, host: Host, row_node: tuple[Any, Any, Running]
-) -> None:
+def test_late_rows_are_historical(broker: Broker, host: Host, row_node: tuple[Any, Any, Running]) -> None:
     _, part, _ = row_node
     host.wait_for("DBIRTH", FAN.name)
     for one in part._brokers:
@@ -423,9 +409,7 @@ def test_rows_polled_while_the_broker_was_away_are_sent_as_historical(
 
 
 @pytest.mark.slow
-def test_a_silent_drive_gets_a_birth_before_its_historical_values_are_sent(
-    host: Host, row_node: tuple[Any, Any, Running]
-) -> None:
+def test_a_birth_precedes_historical_values(host: Host, row_node: tuple[Any, Any, Running]) -> None:
     known, part, running = row_node
     host.wait_for("DBIRTH", FAN.name)
     known.hub.states["pump-1"] = "silent"
@@ -440,9 +424,7 @@ def test_a_silent_drive_gets_a_birth_before_its_historical_values_are_sent(
     host.wait_for("DDEATH", "pump-1")
 
 
-def test_sparkplug_values_sent_live_have_the_time_of_their_poll(
-    host: Host, row_node: tuple[Any, Any, Running]
-) -> None:
+def test_live_values_have_the_time_of_their_poll(host: Host, row_node: tuple[Any, Any, Running]) -> None:
     known, _, running = row_node
     host.wait_for("DBIRTH", FAN.name)
     known.hub.values["pump-1", "output_frequency"] = 48.0

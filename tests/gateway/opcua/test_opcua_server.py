@@ -122,9 +122,7 @@ def stop(client: Any, drive: str = "") -> str:
 
 
 @pytest.mark.slow
-async def test_an_opc_ua_server_that_was_closed_while_starting_accepts_no_client(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+async def test_a_server_closed_while_starting_accepts_no_client(monkeypatch: pytest.MonkeyPatch) -> None:
     """A reload waits at most 3 s for the old server to end, so that server may still be starting."""
     from multidrop.gateway.opcua.server import PlantServer
 
@@ -152,9 +150,7 @@ async def test_an_opc_ua_server_that_was_closed_while_starting_accepts_no_client
 
 
 @pytest.mark.slow
-async def test_closing_the_last_opc_ua_server_frees_nodes_and_resets_python_settings(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+async def test_closing_the_last_server_resets_python_settings(monkeypatch: pytest.MonkeyPatch) -> None:
     """The nodes are freed without a garbage collection.
 
     During the first run, another server is registered.
@@ -260,9 +256,7 @@ def test_opc_ua_clients_cannot_write_values(client: Any) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("drive", "drives"), [("pump-1", ["pump-1"]), ("", ["pump-1", "pump-2"])])
-def test_the_opc_ua_stop_method_stops_the_motors(
-    gateway: Served, client: Any, drive: str, drives: list[str]
-) -> None:
+def test_the_stop_method_stops_motors(gateway: Served, client: Any, drive: str, drives: list[str]) -> None:
     start(gateway, *drives)
     assert "stop" in stop(client, drive)
     until(lambda: all(stands(gateway, one) for one in drives))
@@ -270,9 +264,7 @@ def test_the_opc_ua_stop_method_stops_the_motors(
 
 
 @pytest.mark.slow
-def test_a_stop_method_called_on_another_drives_object_is_sent_but_not_confirmed(
-    gateway: Served, client: Any
-) -> None:
+def test_a_stop_method_of_another_drive_is_sent_but_not_confirmed(gateway: Served, client: Any) -> None:
     start(gateway, "pump-1", "pump-2")
     with pytest.raises(ua.UaStatusCodeError, match="BadMethodInvalid"):
         client.get_node("ns=2;s=pump-2").call_method(client.get_node("ns=2;s=pump-1.Stop").nodeid)
@@ -388,9 +380,7 @@ class Cyclic:
         self.own = self
 
 
-async def test_reference_cycles_are_freed_after_many_drives_were_removed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_removed_drives_are_freed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     async def remove(nodes: PlantNodes, name: str) -> None:
         del nodes._drives[name]
 
@@ -501,9 +491,7 @@ def test_each_row_has_the_expected_opc_ua_status_code(
         (hub.Shown(hub.SILENT, "no reply"), ("Bad_NoCommunication", None)),
     ],
 )
-def test_a_drive_is_shown_without_fault_only_if_its_values_prove_it(
-    shown: hub.Shown, expected: tuple[str, str | None]
-) -> None:
+def test_no_fault_is_shown_only_if_it_is_proved(shown: hub.Shown, expected: tuple[str, str | None]) -> None:
     code, text = fault_of(shown)
     assert (NAMES[code], text) == expected
 

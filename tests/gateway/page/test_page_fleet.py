@@ -71,9 +71,7 @@ def test_old_fleet_values_show_their_age_and_the_reason(opened: Opener, gateway:
     until_met(page, lambda: page.evaluate(style) == "normal")
 
 
-def test_fleet_values_are_marked_as_old_when_the_gateway_is_lost(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_fleet_values_of_a_lost_gateway_are_marked_as_old(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/fleet")
     await_note(page, "Updated once a second")
     gateway.kill()
@@ -129,9 +127,7 @@ def test_key_6_opens_the_fleet_view(opened: Opener) -> None:
     assert page.locator("nav a[aria-current]").inner_text() == "Fleet"
 
 
-def test_stop_all_in_the_fleet_view_stops_only_the_plant_and_says_so(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_stop_all_in_the_fleet_view_stops_only_the_plant(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/fleet")
     stopall = page.locator("#stopall")
     assert stopall.inner_text() == "Stop this plant"
@@ -148,9 +144,7 @@ def test_stop_all_in_the_fleet_view_stops_only_the_plant_and_says_so(
     until(page, "document.querySelector('#stopall').textContent === 'Stop all'")
 
 
-def test_stop_all_stops_the_whole_fleet_if_the_gateway_may_command_it(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_stop_all_stops_the_fleet_if_the_gateway_may(opened: Opener, gateway: FakeGateway) -> None:
     gateway.plant_changes = {"fleet_stop": True}
     gateway.fleet_outcomes = {"hall-9.pump": {"done": True, "text": "stopped"}}
     page = opened("#/fleet")
@@ -163,9 +157,7 @@ def test_stop_all_stops_the_whole_fleet_if_the_gateway_may_command_it(
     assert sorted(gateway.posts) == [("/api/fleet/stop", {}), ("/api/stop", {"drives": None})]
 
 
-def test_a_failed_stop_of_the_fleet_is_reported_besides_the_gateways_own_drives(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_a_failed_stop_of_the_fleet_is_reported(opened: Opener, gateway: FakeGateway) -> None:
     """The servers of the fleet do not answer, but the gateway's own drives are stopped."""
     gateway.plant_changes = {"fleet_stop": True}
     gateway.fleet_outcomes = {"the fleet": {"done": False, "text": "the stop was NOT sent"}}

@@ -108,9 +108,7 @@ def told(page: Any, title: str) -> None:
     page.get_by_role("heading", name=title, exact=True).wait_for()
 
 
-def test_reload_by_keyboard_shows_all_mistakes_in_the_plant_file(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_reload_by_keyboard_shows_mistakes(opened: Opener, gateway: FakeGateway) -> None:
     mistakes = [f"plant.toml: [[line]] {n}: port is missing" for n in range(30)]
     text = "the previous plant stays in use: the file has mistakes"
     gateway.reloaded = {"done": False, "text": text, "mistakes": mistakes, "restart": []}
@@ -136,9 +134,7 @@ def test_reload_by_keyboard_shows_all_mistakes_in_the_plant_file(
     assert gateway.posts == [("/api/reload", {"confirm": True})]
 
 
-def test_reload_is_not_offered_without_a_plant_file_or_the_right(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_reload_needs_a_plant_file_and_the_right(opened: Opener, gateway: FakeGateway) -> None:
     for changed in ({"file": False}, {"may": {"role": "stop", "write": [], "verbs": []}}):
         gateway.plant_changes = changed
         page = opened()

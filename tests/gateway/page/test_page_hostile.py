@@ -101,9 +101,7 @@ def sent_by_form(page: Any, gateway: str) -> int:
     return int(answer.value.status)
 
 
-def test_only_the_gateways_own_page_can_read_values_or_send_commands(
-    strange: Any, elsewhere: int, tmp_path: Path
-) -> None:
+def test_only_the_gateways_page_can_read_or_command(strange: Any, elsewhere: int, tmp_path: Path) -> None:
     with served(tmp_path, MAY) as gateway:
         gateway.await_state("pump-1", "stands")
         port = gateway.gateway.port

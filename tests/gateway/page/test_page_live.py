@@ -47,9 +47,7 @@ def test_a_killed_gateway_is_reported(opened: Opener, gateway: FakeGateway) -> N
     assert page.locator("#said").inner_text() == "Values are old: no new values arrive."
 
 
-def test_a_hanging_gateway_is_reported_and_its_values_become_old(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_values_of_a_hanging_gateway_become_old(opened: Opener, gateway: FakeGateway) -> None:
     page = opened()
     gateway.is_silent = True
     until(page, STALE)
@@ -74,9 +72,7 @@ def test_old_values_stay_old_when_the_clock_of_the_browser_is_set_back(
     until_met(page, lambda: float(age.inner_text().removesuffix(" s")) >= 2)
 
 
-def test_the_web_page_is_live_again_after_a_restart_of_the_gateway(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_the_page_is_live_again_after_a_restart(opened: Opener, gateway: FakeGateway) -> None:
     page = opened()
     gateway.kill()
     until(page, "document.body.classList.contains('dead')")
@@ -150,9 +146,7 @@ def test_values_of_a_slow_line_stay_current_as_long_as_the_gateway_reports(
     assert page.locator("tr.drive", has_text="pump-2").locator(".value.old").count() == 0
 
 
-def test_problems_that_the_gateway_reports_are_shown_in_the_notice(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_problems_of_the_gateway_are_in_the_notice(opened: Opener, gateway: FakeGateway) -> None:
     gateway.changes = {"troubles": ["history: nothing is recorded: No space left on device", "mqtt: <b>"]}
     page = opened()
     notice = page.locator("#notice")

@@ -56,9 +56,7 @@ def test_stop_all_is_always_at_the_same_place_and_never_covered(opened: Opener) 
         assert 0 <= y <= y + height <= high
 
 
-def test_stop_all_works_on_a_phone_while_the_view_of_a_drive_is_open(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_stop_all_works_on_a_phone_in_the_view_of_a_drive(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/drives/filler-2", "phone", has_touch=True)
     page.locator("#panel.open h2").wait_for()
     page.locator("#stopall").tap()
@@ -142,9 +140,7 @@ def test_stop_all_works_while_another_dialog_is_open(opened: Opener, gateway: Fa
     assert gateway.posts == [("/api/stop", {"drives": None})]
 
 
-def test_the_result_of_a_stop_does_not_replace_the_question_of_another_stop(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_a_stops_result_does_not_replace_another_stops_question(opened: Opener, gateway: FakeGateway) -> None:
     """The result of the stop of one drive arrives while the question of Stop all is open."""
     page = opened("#/drives/pump-1")
     gateway.is_held = threading.Event()
@@ -180,9 +176,7 @@ def test_the_web_page_works_without_its_plot_library(opened: Opener) -> None:
     assert page.locator(".registers tbody tr").count() == 12
 
 
-def test_the_result_of_a_stop_names_the_drives_that_did_not_stop(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_the_result_of_a_stop_names_drives_still_running(opened: Opener, gateway: FakeGateway) -> None:
     gateway.outcomes = {"pump-3": {"done": False, "text": "no reply; it may still run"}}
     page = opened()
     page.locator("#stopall").click()
@@ -214,9 +208,7 @@ CLOSED = """() => new MutationObserver((_, observer) => {
 
 
 @pytest.mark.parametrize("is_closed", [False, True])
-def test_a_stop_at_a_frozen_gateway_shows_a_warning_within_two_seconds(
-    opened: Opener, gateway: FakeGateway, is_closed: bool
-) -> None:
+def test_a_frozen_gateway_is_reported_in_2_s(opened: Opener, gateway: FakeGateway, is_closed: bool) -> None:
     gateway.is_held = threading.Event()
     page = opened()
     page.locator("#stopall").click()
@@ -256,9 +248,7 @@ def test_an_emergency_stop_at_a_frozen_gateway_shows_a_warning(opened: Opener, g
     page.locator("#outcomes li").wait_for()
 
 
-def test_a_user_who_types_a_token_slowly_gets_no_warning_of_a_frozen_gateway(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_typing_a_token_slowly_shows_no_warning(opened: Opener, gateway: FakeGateway) -> None:
     gateway.token = "right"
     page = opened()
     page.locator("#stopall").click()
@@ -270,9 +260,7 @@ def test_a_user_who_types_a_token_slowly_gets_no_warning_of_a_frozen_gateway(
     told(page, "All 10 drives are stopped")
 
 
-def test_a_stop_without_the_right_asks_for_a_token_and_is_then_sent(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_a_stop_without_the_right_asks_for_a_token(opened: Opener, gateway: FakeGateway) -> None:
     gateway.token = "right"
     page = opened()
     page.locator("#stopall").click()
@@ -363,9 +351,7 @@ def test_eight_tabs_with_six_connections_show_live_values_and_can_stop_drives(
 
 
 @pytest.mark.parametrize("case", ["a write that wants a token", "a reload"])
-def test_a_later_dialog_does_not_replace_the_question_of_a_stop(
-    opened: Opener, gateway: FakeGateway, case: str
-) -> None:
+def test_a_later_dialog_does_not_replace_a_stops(opened: Opener, gateway: FakeGateway, case: str) -> None:
     """The answer to an earlier request arrives while the question is open."""
     path = "api/reload" if case == "a reload" else "api/write"
     held: list[Any] = []
@@ -438,9 +424,7 @@ def test_the_stop_key_works_behind_a_dialog_but_not_in_a_text_field(opened: Open
 
 
 @pytest.mark.parametrize("verb", ["stop", "emergency stop"])
-def test_the_web_page_waits_longer_for_a_stop_than_the_gateway_repeats_it(
-    opened: Opener, gateway: FakeGateway, verb: str
-) -> None:
+def test_the_page_waits_longer_than_stops_repeat(opened: Opener, gateway: FakeGateway, verb: str) -> None:
     """With one dead drive, the page could otherwise never show which drives have stopped."""
     page = opened("#/drives/pump-1")
     page.evaluate("""() => {

@@ -292,9 +292,7 @@ def english_in(texts: list[str]) -> set[str]:
 
 @pytest.mark.long
 @pytest.mark.parametrize("language", ["ru", "zh"])
-def test_each_view_fits_a_narrow_screen_and_has_no_english_text_left(
-    opened: Opener, axe: str, language: str
-) -> None:
+def test_each_view_fits_a_narrow_screen_without_english_text(opened: Opener, axe: str, language: str) -> None:
     page = opened(live=False, locale=language)
     page.set_viewport_size(NARROW)
     until(page, f"document.querySelector('#link').textContent === '{LIVE[language]}'")
@@ -349,9 +347,7 @@ def test_the_language_chosen_on_the_page_has_precedence_and_is_kept(opened: Open
 
 
 @pytest.mark.long
-def test_titles_of_registers_are_shown_in_the_language_of_the_gateways_answer(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_register_titles_are_in_the_language_of_the_answer(opened: Opener, gateway: FakeGateway) -> None:
     first = fake_plant.plant({})["lines"][0]
     titled = [one | {"title": f"«{one['name']}»"} for one in first["drives"][0]["registers"]]
     gateway.plant_changes = {"lines": [first | {"drives": [first["drives"][0] | {"registers": titled}]}]}
@@ -362,9 +358,7 @@ def test_titles_of_registers_are_shown_in_the_language_of_the_gateways_answer(
 
 
 @pytest.mark.long
-def test_the_page_without_its_texts_is_in_english_and_stops_drives(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_the_page_without_its_texts_is_english_and_can_stop(opened: Opener, gateway: FakeGateway) -> None:
     page = opened(live=False, locale="ru-RU", prepare=aborting("**/page/texts.ru.json"))
     page.locator("#link").get_by_text("live", exact=True).wait_for()
     assert page.locator("html").get_attribute("lang") == "en"

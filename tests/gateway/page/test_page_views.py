@@ -56,9 +56,7 @@ def test_the_filter_hides_lines_without_matches(opened: Opener) -> None:
     assert page.locator("#table tbody tr:visible").count() == 0
 
 
-def test_lines_of_a_large_plant_are_folded_unless_they_have_problems(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_lines_of_a_large_plant_are_folded_without_problems(opened: Opener, gateway: FakeGateway) -> None:
     lines = [line_of_one(n, 50) for n in range(2)]
     for n, line in enumerate(lines):
         line["drives"] = [line["drives"][0] | {"name": f"fan-{n}-{i}"} for i in range(40)]
@@ -337,9 +335,7 @@ def test_a_trigger_without_values_in_the_history_shows_a_sentence(
     until_met(page, lambda: sentence in note.inner_text())
 
 
-def test_markers_and_cursor_show_the_newest_current_value_of_each_drive(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_markers_and_cursor_show_the_newest_value_of_each_drive(opened: Opener, gateway: FakeGateway) -> None:
     """In a short range, the samples of the two drives have different times."""
     begin = 1764075600000
     for drive, offset in (("pump-1", 0), ("pump-2", 400)):
@@ -436,9 +432,7 @@ def test_number_of_selected_drives_is_limited_to_the_number_of_line_styles(opene
     assert checked == [True] * 24 + [False] * 7
 
 
-def test_time_before_the_start_of_the_gateway_is_not_shown_as_free_of_faults(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_time_before_the_start_is_not_shown_as_free_of_faults(opened: Opener, gateway: FakeGateway) -> None:
     """The gateway started in the middle of the shown hour."""
     page = opened("#/trends?drive=pump-2&from=1764075600000&to=1764079200000")
     lanes = page.locator("#lane .bars")
@@ -452,9 +446,7 @@ def test_time_before_the_start_of_the_gateway_is_not_shown_as_free_of_faults(
     assert all(abs(part - 0.5) < 0.02 for part in lanes.evaluate_all(part))
 
 
-def test_values_in_another_unit_have_their_own_plot_and_omitted_units_are_listed(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_another_unit_has_its_own_plot_and_more_are_listed(opened: Opener, gateway: FakeGateway) -> None:
     gateway.recorded = {
         "pump-1.output_current": {"unit": "%", "left_out": ["A", ""]},
         "pump-2.output_current": {"unit": "A", "left_out": []},

@@ -73,9 +73,7 @@ def test_lost_gateway_is_reported_in_one_sentence(opened: Opener, gateway: FakeG
     assert re.fullmatch(told, page.locator("#notice").inner_text())
 
 
-def test_figures_of_a_lost_gateway_look_old_and_failed_reads_are_hidden(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_figures_of_a_lost_gateway_look_old(opened: Opener, gateway: FakeGateway) -> None:
     page = opened()
     figures = [page.locator(where).last for where in ("tr.head .wire span", "#chips b", "#strip li")]
     style = "element => getComputedStyle(element).fontStyle"
@@ -88,9 +86,7 @@ def test_figures_of_a_lost_gateway_look_old_and_failed_reads_are_hidden(
     assert "counted yet" not in page.locator("#lines").inner_text()
 
 
-def test_durations_of_faults_are_right_if_faults_arrive_before_the_first_values(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_fault_durations_are_right_before_the_first_values(opened: Opener, gateway: FakeGateway) -> None:
     gateway.is_silent = True
     page = opened("#/faults", live=False)
     lasted = page.locator("#faults td").get_by_text("so far").nth(1)
@@ -133,9 +129,7 @@ def test_a_plant_with_one_drive_is_described_in_the_singular(opened: Opener, gat
     page.get_by_text(re.compile("· 1 drive$")).wait_for()
 
 
-def test_the_alarm_strip_has_the_colour_of_a_fault_whose_text_does_not_fit(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_the_alarm_strip_has_the_colour_of_a_hidden_fault(opened: Opener, gateway: FakeGateway) -> None:
     now = fake_plant.ms(time.time())
     silent, fault = ({"text": "no reply", "kind": "silent"}, {"text": "undervoltage", "kind": "fault"})
     kinds = zip(("labeller", "screw", "booster-1"), (silent, silent, fault), strict=True)
@@ -150,9 +144,7 @@ def test_the_alarm_strip_has_the_colour_of_a_fault_whose_text_does_not_fit(
     assert page.locator("#strip.bad").count() == 1
 
 
-def test_the_newest_minute_is_at_the_right_end_of_the_chart_of_an_hour(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_the_newest_minute_is_at_the_right_end_of_the_chart(opened: Opener, gateway: FakeGateway) -> None:
     """The chart of a gateway that started two minutes ago has two bars, both at the right end."""
     newest = 1_764_115_200_000  # 00:00 UTC
     minutes = [
@@ -172,9 +164,7 @@ def test_the_newest_minute_is_at_the_right_end_of_the_chart_of_an_hour(
     assert "No full minute counted yet." in begun.inner_text()
 
 
-def test_long_names_that_differ_only_at_their_ends_are_shown_whole(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_long_names_with_different_ends_are_shown_whole(opened: Opener, gateway: FakeGateway) -> None:
     names = [f"conveyor-of-the-bottling-hall-south-no-{n:02}" for n in (1, 2)]
     gateway.renamed = dict(zip(("pump-1", "pump-2"), names, strict=True))
     page = opened()
@@ -195,9 +185,7 @@ def test_the_age_of_an_old_value_is_shown(opened: Opener) -> None:
     until_met(page, lambda: bool(re.fullmatch(r"\d+ min", row.locator(".age").inner_text())))
 
 
-def test_values_read_for_a_viewer_become_old_only_if_the_drive_stops_answering(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_values_read_for_a_viewer_become_old_with_their_drive(opened: Opener, gateway: FakeGateway) -> None:
     """A viewed register may be read only once a minute. Its value stays current while the drive answers."""
     page = opened()
     value = page.locator("#panel tr", has_text="run hours").locator(".value")
@@ -284,9 +272,7 @@ def test_an_alarm_is_acknowledged_with_a_note(opened: Opener, alarmed: FakeGatew
     assert "there is no such alarm" in page.locator("#ask").inner_text()
 
 
-def test_many_failed_reads_show_a_warning_and_a_single_one_does_not(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_many_failed_reads_show_a_warning_but_not_one(opened: Opener, gateway: FakeGateway) -> None:
     gateway.drive_changes = {"pump-1": {"missed": 0.0003}, "pump-2": {"missed": 0.05}}
     gateway.changes = {"lines": {name: line | {"misses": 1} for name, line in lines().items()}}
     page = opened()
@@ -299,9 +285,7 @@ def test_many_failed_reads_show_a_warning_and_a_single_one_does_not(
     page.locator(".linehead .warn").first.wait_for()
 
 
-def test_a_drive_at_rest_whose_state_is_unknown_is_not_shown_as_faulty(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_a_drive_of_unknown_state_at_rest_is_not_faulty(opened: Opener, gateway: FakeGateway) -> None:
     why = "the outputs are not programmed"
     gateway.drive_changes = {name: {"state": "unknown", "note": why} for name in ("pump-4", "pump-1")}
     page = opened("#/drives/pump-4")

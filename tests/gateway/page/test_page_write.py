@@ -19,9 +19,7 @@ CONFIRMED_AT = """([x, y]) => new MutationObserver(() => {
 }).observe(document.querySelector('#ask'), { childList: true })"""
 
 
-def test_the_user_confirms_a_write_by_the_drives_name_and_it_is_sent_once(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_a_write_is_confirmed_by_name_and_sent_once(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/drives/pump-1")
     # the plant file allows writes to one register
     assert page.get_by_role("button", name="Change").count() == 1
@@ -48,9 +46,7 @@ def test_the_result_of_a_write_is_shown_in_the_gateways_words(opened: Opener, ga
     assert "the drive took 30.0 Hz instead" in page.locator("#outcomes").inner_text()
 
 
-def test_a_command_without_an_answer_is_shown_as_unknown_and_not_repeated(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_an_unanswered_command_is_unknown_and_not_repeated(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/drives/pump-1")
     page.route("**/api/act", lambda route: route.abort())
     page.get_by_role("button", name="start").click()
@@ -74,9 +70,7 @@ def test_a_command_with_a_truncated_answer_is_shown_as_unknown(opened: Opener, g
     page.locator("#writes").get_by_text("The gateway's answer was cut off.").wait_for()
 
 
-def test_the_dialog_of_a_start_warns_and_pressing_enter_does_not_confirm_it(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_the_enter_key_does_not_confirm_a_start(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/drives/pump-1")
     page.get_by_role("button", name="start").click()
     assert page.locator("#ask-title").inner_text() == "start: pump-1?"
@@ -184,9 +178,7 @@ def press(page: Any, key: str, made_s: float, text: str = "") -> None:
 
 
 @pytest.mark.parametrize(("key", "text"), [("Enter", "\r"), (" ", " ")], ids=["Enter", "Space"])
-def test_keys_pressed_before_a_dialog_is_drawn_do_not_confirm_it(
-    opened: Opener, gateway: FakeGateway, key: str, text: str
-) -> None:
+def test_early_keys_confirm_no_dialog(opened: Opener, gateway: FakeGateway, key: str, text: str) -> None:
     """On a slow page, Tab and Enter could otherwise confirm a dialog before the user has seen it."""
     page = opened("#/drives/pump-1")
     until_still(page)
@@ -206,9 +198,7 @@ def test_keys_pressed_before_a_dialog_is_drawn_do_not_confirm_it(
     assert gateway.posts == [("/api/act", {"drive": "pump-1", "verb": "start", "options": {}})]
 
 
-def test_a_command_names_the_page_frame_that_was_shown_at_its_confirmation(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_a_command_names_the_frame_shown_at_its_confirmation(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/drives/pump-1")
     newest = "import('/page/data/store.js').then(m => m.store.frame.n)"
     page.get_by_role("button", name="start").click()
@@ -220,9 +210,7 @@ def test_a_command_names_the_page_frame_that_was_shown_at_its_confirmation(
     assert before <= gateway.seen[0] <= page.evaluate(newest)
 
 
-def test_a_stop_while_the_dialog_of_a_start_is_open_prevents_the_start(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_a_stop_during_the_dialog_of_a_start_prevents_it(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/drives/pump-1")
     page.get_by_role("button", name="start").click()
     gateway.stops = {"pump-1": 1}
@@ -237,9 +225,7 @@ def test_a_stop_while_the_dialog_of_a_start_is_open_prevents_the_start(
     until_met(page, lambda: gateway.posts)
 
 
-def test_a_reload_while_the_dialog_of_a_start_is_open_prevents_the_start(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_a_reload_during_the_dialog_of_a_start_prevents_it(opened: Opener, gateway: FakeGateway) -> None:
     """After the reload, the name in the dialog may mean another drive."""
     page = opened("#/drives/pump-1")
     page.get_by_role("button", name="start", exact=True).click()
@@ -255,9 +241,7 @@ def test_a_reload_while_the_dialog_of_a_start_is_open_prevents_the_start(
     until_met(page, lambda: gateway.posts)
 
 
-def test_an_emergency_stop_is_sent_although_a_stop_came_during_its_dialog(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_an_emergency_stop_is_sent_despite_a_stop_before_it(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/drives/pump-1")
     page.get_by_role("button", name="emergency stop").click()
     gateway.stops = {"pump-1": 1}
@@ -285,9 +269,7 @@ def test_commands_that_the_settings_forbid_are_not_offered(opened: Opener) -> No
     assert page.get_by_role("button", name="Stop pump-2").is_visible()
 
 
-def test_the_dialog_set_frequency_shows_value_and_range_and_checks_the_input(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_the_dialog_set_frequency_checks_the_input(opened: Opener, gateway: FakeGateway) -> None:
     gateway.maximum_hz = 45.0
     page = opened("#/drives/pump-1")
     page.locator(".registers tr", has_text="maximum frequency").get_by_text("45.0").wait_for()
@@ -307,9 +289,7 @@ def test_the_dialog_set_frequency_shows_value_and_range_and_checks_the_input(
     ]
 
 
-def test_a_value_above_the_maximum_frequency_register_is_not_sent(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_a_value_above_the_maximum_frequency_is_not_sent(opened: Opener, gateway: FakeGateway) -> None:
     gateway.maximum_hz = 45.0
     page = opened("#/drives/pump-1")
     page.locator(".registers tr", has_text="maximum frequency").get_by_text("45.0").wait_for()
