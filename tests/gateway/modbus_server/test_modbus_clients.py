@@ -146,14 +146,6 @@ async def test_busy_clients_share_the_time_slice_of_one_event_loop_cycle() -> No
     assert share.slice_s == modbus_clients.SLICE_S
 
 
-async def test_a_client_with_slow_answers_ends_its_turn_early() -> None:
-    client, transport = connected(port_of(slowly))
-    client.data_received(b"".join(request(number, 1, 3, 0, 125) for number in range(100)))
-    assert len(transactions(transport.written)) < 10
-    await asyncio.sleep(1)
-    assert transactions(transport.written) == list(range(100))
-
-
 async def test_invalid_bytes_close_the_connection_after_earlier_requests_are_answered() -> None:
     port = port_of()
     client, transport = connected(port)
@@ -212,11 +204,12 @@ async def test_writes_start_on_arrival_and_in_their_order(is_stalled: bool) -> N
     assert begun == transactions(transport.written) == [500, 501, *range(500)]
 
 
-async def test_parsing_of_received_writes_is_interrupted_after_each_time_slice() -> None:
+@pytest.mark.parametrize("frames", [reads, writes])
+async def test_a_turn_of_slow_answers_ends_early(frames: Callable[[int, int], bytes]) -> None:
     client, transport = connected(port_of(slowly))
-    client.data_received(writes(0, 100))
+    client.data_received(frames(0, 100))
     assert len(transactions(transport.written)) < 10
-    assert not transport.is_reading
+    assert transport.is_reading is (frames is reads)
     await asyncio.sleep(1)
     assert transactions(transport.written) == list(range(100))
     assert transport.is_reading

@@ -165,16 +165,20 @@ def test_values_polled_before_a_command_are_not_used_after_a_reload(gateway: Gat
         assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [CHE_OUTPUT_VOLTAGE]
 
 
-@table("function", [1, 2, 3, 4])
-@table(("start", "count", "expected"), [(0, 0, 3), (0, 2001, 3), (0xFFFF, 2, 2), (0x7000, 1, 2)])
+@table(
+    ("function", "start", "count", "expected"),
+    [
+        *((function, 0, 0, 3) for function in (1, 2, 3, 4)),
+        *((function, 0, 2001, 3) for function in (1, 2, 3, 4)),
+        *((function, 0xFFFF, 2, 2) for function in (1, 2, 3, 4)),
+        *((function, 0x7000, 1, 2) for function in (1, 2, 3, 4)),
+        (3, 0, 126, 3),  # one word more than a reply can have
+    ],
+)
 def test_invalid_address_ranges_are_answered_with_exception_codes(
     gateway: Gateway, function: int, start: int, count: int, expected: int
 ) -> None:
     assert code(gateway, 1, function, start, count) == expected
-
-
-def test_read_of_126_words_is_refused(gateway: Gateway) -> None:
-    assert code(gateway, 1, 3, 0, 126) == 3
 
 
 @table("function", [1, 3, 5, 6])
@@ -285,13 +289,27 @@ def test_a_write_is_carried_out_by_the_gateways_commands_and_echoed(gateway: Gat
         (5, (6, 0xFF00), b"", 2),
         (15, (5, 2), b"\1\3", 3),
         (15, (5, 1), b"\2\0\0", 3),
+        # the common register block
+        (6, (BLOCK + 10, 0), b"", 3),
+        (6, (BLOCK, 1), b"", 2),
+        (16, (BLOCK + 10, 2), b"\4\0\0\0\1", 3),
+        (16, (BLOCK + 9, 2), b"\4\0\1\0\0", 2),
+        (16, (BLOCK + 11, 1), b"\2\0\1", 2),
     ],
 )
 def test_invalid_writes_are_refused(
     gateway: Gateway, function: int, words: tuple[int, ...], data: bytes, expected: int
 ) -> None:
     assert code(gateway, 2, function, *words, data=data) == expected
-    assert gateway.commands.written == []
+    assert (gateway.commands.written, gateway.commands.stopped) == ([], [])
+
+
+@table(("address", "words"), [(CHE_CONTROL, (1, 5)), (CHE_CONTROL - 1, (5, 1)), (CHE_SETPOINT, (5, 5))])
+def test_a_write_of_two_registers_without_a_stop_is_refused(
+    gateway: Gateway, address: int, words: tuple[int, int]
+) -> None:
+    assert code(gateway, 1, 16, address, 2, data=struct.pack(">B2H", 4, *words)) in (2, 3)
+    assert (gateway.commands.written, gateway.commands.stopped) == ([], [])
 
 
 OUTCOMES = [
@@ -341,13 +359,11 @@ def test_a_write_that_waited_while_the_gateway_was_suspended_is_refused(gateway:
 
 def test_a_read_only_gateway_refuses_writes_as_illegal_function() -> None:
     with serving(plant(), ModbusSettings(listen="127.0.0.1:0")) as gateway:
-        for function, words in (
-            (5, (5, 0xFF00)),
-            (6, (CHE_SETPOINT, 1)),
-            (6, (CHE_CONTROL, 5)),
-            (6, (BLOCK + 10, 1)),
+        for function, address, value in (
+            *((5, 5, 0xFF00), (6, CHE_SETPOINT, 1), (6, CHE_CONTROL, 5), (6, BLOCK + 10, 1)),
         ):
-            assert code(gateway, 1, function, *words) == 1
+            assert code(gateway, 1, function, address, value) == 1
+        assert code(gateway, 1, 16, CHE_CONTROL, 2, data=b"\4\0\5\0\0") == 1  # contains a stop
         assert (gateway.commands.written, gateway.commands.stopped) == ([], [])
 
 
@@ -385,37 +401,20 @@ def test_each_write_that_means_stop_calls_a_stop(gateway: Gateway) -> None:
     assert stopped == [["mill"]] * 4 + [["pump"]] + [["belt"]] * 4
 
 
-@table(
-    ("function", "words", "data", "expected"),
-    [
-        (6, (BLOCK + 10, 0), b"", 3),
-        (6, (BLOCK, 1), b"", 2),
-        (16, (BLOCK + 10, 2), b"\4\0\0\0\1", 3),
-        (16, (BLOCK + 9, 2), b"\4\0\1\0\0", 2),
-        (16, (BLOCK + 11, 1), b"\2\0\1", 2),
-    ],
-)
-def test_other_writes_to_the_common_register_block_are_refused_and_do_not_stop(
-    gateway: Gateway, function: int, words: tuple[int, ...], data: bytes, expected: int
-) -> None:
-    assert code(gateway, 1, function, *words, data=data) == expected
-    assert gateway.commands.stopped == []
-
-
 MIXED = {  # unit id, address and words; each write contains a stop
     "the stop first": (1, CHE_CONTROL, (5, 0)),
-    "amid others": (1, CHE_CONTROL - 1, (7, 5, 7)),
+    "between others": (1, CHE_CONTROL - 1, (7, 5, 7)),
     "a coast": (1, CHE_CONTROL, (6, 1)),
     "with a setpoint": (3, IBD_CONTROL, (IBD_STOP, 5000)),
     "the common block's": (4, BLOCK + 10, (1, 1)),
-    "behind the common block's state": (4, BLOCK + 9, (1, 0xFF00)),
+    "after the common block's state": (4, BLOCK + 9, (1, 0xFF00)),
     "a whole block of 16": (4, BLOCK, (*[0] * 10, 1, *[0] * 5)),
 }
 
 
 @table("mixed", MIXED)
 @table("may", ["stop", "write"])
-def test_of_a_write_of_several_words_only_the_stop_is_sent(mixed: str, may: str) -> None:
+def test_only_the_stop_in_a_write_of_several_words_is_sent(mixed: str, may: str) -> None:
     unit, address, words = MIXED[mixed]
     data = struct.pack(f">B{len(words)}H", 2 * len(words), *words)
     with serving(plant(), ModbusSettings(listen="127.0.0.1:0", may=may)) as gateway:
@@ -427,7 +426,7 @@ def test_of_a_write_of_several_words_only_the_stop_is_sent(mixed: str, may: str)
         assert gateway.commands.written == []
 
 
-def test_of_a_write_of_several_coils_only_the_stop_is_sent() -> None:
+def test_only_the_stop_in_a_write_of_several_coils_is_sent() -> None:
     """Coils 0 to 2 of the ER-G-220 are start, stop, and emergency stop. The write sets only stop."""
     drives = plant_of(("hall", ErmanERG220(1, name="mixer")))
     with serving(drives, ModbusSettings(listen="127.0.0.1:0", may="write")) as gateway:
@@ -437,19 +436,6 @@ def test_of_a_write_of_several_coils_only_the_stop_is_sent() -> None:
         until(lambda: bool(gateway.commands.stopped))  # the request is answered before the stop is sent
         assert [drives for drives, _ in gateway.commands.stopped] == [["mixer"]]
         assert gateway.commands.written == []
-
-
-@table(("address", "words"), [(CHE_CONTROL, (1, 5)), (CHE_CONTROL - 1, (5, 1)), (CHE_SETPOINT, (5, 5))])
-def test_writes_without_a_stop_are_refused(gateway: Gateway, address: int, words: tuple[int, ...]) -> None:
-    data = struct.pack(f">B{len(words)}H", 2 * len(words), *words)
-    assert code(gateway, 1, 16, address, len(words), data=data) in (2, 3)
-    assert (gateway.commands.written, gateway.commands.stopped) == ([], [])
-
-
-def test_a_read_only_gateway_ignores_a_stop_in_a_write_of_several_words() -> None:
-    with serving(plant(), ModbusSettings(listen="127.0.0.1:0")) as gateway:
-        assert code(gateway, 1, 16, CHE_CONTROL, 2, data=b"\4\0\5\0\0") == 1
-        assert gateway.commands.stopped == []
 
 
 class HeldCommands:
@@ -563,11 +549,8 @@ def test_the_common_register_block_contains_the_values_of_a_running_drive(gatewa
         assert 250 <= found[9] < 5000
         assert found[10] == 0
     assert gateway.line.asked == []
-
-
-def test_large_numbers_use_both_words_in_the_common_register_block(gateway: Gateway) -> None:
     gateway.hub.values["mill", "output_frequency"] = 1500.0
-    assert block(gateway)[2:4] == [2, 0x49F0]  # 150000
+    assert block(gateway)[2:4] == [2, 0x49F0]  # 150000 has two words
 
 
 def test_unknown_values_in_the_common_register_block_read_as_reserved_numbers(gateway: Gateway) -> None:

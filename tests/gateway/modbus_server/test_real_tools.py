@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any
@@ -11,80 +11,20 @@ import pytest
 from examples import usually
 from gateways import Served, served
 from lines import until
-from modbus_tools import NO_REPLY, Libmodbus, Mbpoll
-from peers import require_module
+from modbus_tools import Libmodbus, Mbpoll, Minimalmodbus, Pymodbus
 
 from multidrop.control import read_audit
 
 SETPOINT, CONTROL, OUTPUT_VOLTAGE, OUTPUT_CURRENT = 0x2000, 0x1000, 0x3003, 0x3004  # CHE100 manual, p. 117
 START, STOP = 1, 5
 VOLTAGE = 231
-
-
-class Pymodbus:
-    """A client of pymodbus on a serial port, or with RTU framing over TCP."""
-
-    def __init__(self, path: str, tcp: int = 0) -> None:
-        client = require_module("pymodbus.client")
-        framer = require_module("pymodbus").FramerType.RTU
-        if tcp:
-            self._client = client.ModbusTcpClient("127.0.0.1", port=tcp, framer=framer, timeout=10)
-        else:
-            self._client = client.ModbusSerialClient(path, framer=framer, baudrate=115200, timeout=10)
-        assert self._client.connect()
-
-    def read(self, unit: int, function: int, start: int, count: int) -> list[int] | int:
-        found = self._client.read_holding_registers(start, count=count, device_id=unit)
-        return NO_REPLY if found.isError() else list(found.registers)
-
-    def write(self, unit: int, function: int, address: int, value: int) -> int:
-        return NO_REPLY if self._client.write_register(address, value, device_id=unit).isError() else 0
-
-    def close(self) -> None:
-        self._client.close()
-
-
-class Minimalmodbus:
-    """The library minimalmodbus on a serial port."""
-
-    def __init__(self, path: str) -> None:
-        self._module = require_module("minimalmodbus")
-        self._instrument = self._module.Instrument(path, 1)
-        self._instrument.serial.baudrate = 4800
-        self._instrument.serial.timeout = 10
-
-    def read(self, unit: int, function: int, start: int, count: int) -> list[int] | int:
-        try:
-            return list(self._instrument.read_registers(start, count))
-        except self._module.ModbusException:
-            return NO_REPLY
-
-    def write(self, unit: int, function: int, address: int, value: int) -> int:
-        try:
-            self._instrument.write_register(address, value, functioncode=function)
-        except self._module.ModbusException:
-            return NO_REPLY
-        return 0
-
-    def close(self) -> None:
-        self._instrument.serial.close()
-
-
-TOOLS = ["mbpoll", "libmodbus", "pymodbus", "pymodbus tcp", "minimalmodbus"]
-
-
-@contextmanager
-def tool_of(name: str, path: str, tcp: int, built: Path) -> Iterator[Any]:
-    """Yield the tool of this name, connected to the tool port."""
-    tools: dict[str, Callable[[], Any]] = {
-        "mbpoll": lambda: Mbpoll(path, "-m", "rtu", "-b", "19200"),
-        "libmodbus": lambda: Libmodbus(path, built),
-        "pymodbus": lambda: Pymodbus(path),
-        "pymodbus tcp": lambda: Pymodbus(path, tcp),
-        "minimalmodbus": lambda: Minimalmodbus(path),
-    }
-    with closing(tools[name]()) as tool:
-        yield tool
+TOOLS = {  # the tools, made from the path of the serial port, the TCP port and a folder for programs
+    "mbpoll": lambda path, tcp, built: Mbpoll(path, "-m", "rtu", "-b", "19200"),
+    "libmodbus": lambda path, tcp, built: Libmodbus(path, built),
+    "pymodbus": lambda path, tcp, built: Pymodbus(path),
+    "pymodbus tcp": lambda path, tcp, built: Pymodbus(tcp),
+    "minimalmodbus": lambda path, tcp, built: Minimalmodbus(path),
+}
 
 
 SERVE = """
@@ -109,7 +49,7 @@ def connected(name: str, folder: Path, serve: str) -> Iterator[tuple[Served, Any
         gateway.await_state("pump-1", "stands")
         ports = gateway.gateway.feeds["tool"]
         tcp = ports.ports["hall"]  # type: ignore[attr-defined]
-        yield gateway, stack.enter_context(tool_of(name, str(folder / "hall"), tcp, folder))
+        yield gateway, stack.enter_context(closing(TOOLS[name](str(folder / "hall"), tcp, folder)))
 
 
 def read(tool: Any, start: int, count: int) -> list[int]:

@@ -84,15 +84,6 @@ def test_stale_values_are_null_and_silent_drives_offline(listener: Listener, sta
     assert json_of(said)["values"]["output_frequency"] is None
 
 
-@pytest.mark.slow
-def test_the_broker_publishes_offline_when_the_gateway_disappears(listener: Listener, start: Start) -> None:
-    _, running = start()
-    listener.wait_for(has("multidrop/gateway", b"online"))
-    running.cut(0)
-    listener.wait_for(has("multidrop/gateway", b"offline"))
-    listener.wait_for(has("multidrop/gateway", b"online"))
-
-
 def test_the_message_offline_is_retained(broker: Broker, listener: Listener, start: Start) -> None:
     _, running = start()
     listener.wait_for(has("multidrop/gateway", b"online"))
@@ -136,7 +127,7 @@ def test_closing_the_gateway_publishes_offline(broker: Broker, listener: Listene
         listener.wait_for(has(f"multidrop/{drive}/available", b"offline"))
 
 
-def test_a_failing_publisher_is_offline_and_stops(broker: Broker, listener: Listener, start: Start) -> None:
+def test_failing_publications_do_not_prevent_stops(broker: Broker, listener: Listener, start: Start) -> None:
     """Without "offline", the values that the broker retains would look current."""
     known, running = start(commands=True)
     listener.wait_for(has("multidrop/gateway", b"online"))
@@ -359,10 +350,7 @@ async def test_a_stop_verb_finds_drives_by_another_unicode_spelling(
     assert known.commands.noted == [("act", drive, "coast", {}) for drive in stopped]
 
 
-def test_an_unknown_verb_is_refused(broker: Broker, listener: Listener, commanded: Any) -> None:
-    order = {"verb": "start", "drive": FAN.name, "time": now_ms()}
-    publish(broker, "multidrop/pump-1/act", json.dumps(order).encode())
-    assert f"the message names drive '{FAN.name}'" in told(listener)["text"]
+def test_a_verb_that_is_not_a_text_is_refused(broker: Broker, listener: Listener, commanded: Any) -> None:
     publish(broker, "multidrop/pump-1/act", b'{"verb": ["coast"], "drive": "pump-1", "time": 1}')
     assert not told(listener)["done"]
     assert commanded.commands.noted == []
@@ -458,16 +446,6 @@ def test_an_infinite_value_is_published_as_null(listener: Listener, start: Start
     assert b'"output_frequency": null' in said.payload
 
 
-def test_commands_are_not_subscribed_by_default(broker: Broker, listener: Listener, start: Start) -> None:
-    known, running = start()
-    listener.wait_for(has("multidrop/gateway", b"online"))
-    publish(broker, "multidrop/stop", b"stop", "-q", "1")
-    listener.wait_for(has("multidrop/stop"))
-    running.step()
-    listener.wait_for(has("multidrop/pump-1"))
-    assert known.commands.noted == []
-
-
 def test_without_commands_the_only_command_topic_is_that_of_the_sparkplug_node(tmp_path: Path) -> None:
     require_module("paho.mqtt.client")
     part: Any = build(MqttSettings(sparkplug="works", node="line"), inside(tmp_path))
@@ -521,16 +499,10 @@ def test_home_assistant_discovers_each_drive(broker: Broker, listener: Listener,
 
 
 def test_the_home_assistant_template_can_write(broker: Broker, listener: Listener, start: Start) -> None:
-    jinja2 = require_module("jinja2")
     known, _ = start(home_assistant=True, commands=True)
     said = listener.wait_for(has("homeassistant/device/multidrop-pump-1/config"))
     part = json_of(said)["cmps"]["setpoint_set"]
-    environment = jinja2.Environment()
-    template = environment.from_string(part["command_template"])
-
-    publish(
-        broker, part["command_topic"], template.render(value=12.5, now=lambda: datetime.now(UTC)).encode()
-    )
+    publish(broker, part["command_topic"], command_of(part, 12.5).encode())
     assert told(listener)["done"]
     assert known.commands.noted == [("write", "pump-1", "setpoint", 12.5)]
 
@@ -555,6 +527,12 @@ def configured(drive: Drive, polled: Sequence[str], writable: Sequence[str], **m
 def rendered(part: dict[str, Any], said: dict[str, Any]) -> str:
     jinja2 = require_module("jinja2")
     return str(jinja2.Environment().from_string(part["value_template"]).render(value_json=said))
+
+
+def command_of(part: dict[str, Any], value: object) -> str:
+    """Return the message that Home Assistant publishes for a new value of a component."""
+    template = require_module("jinja2").Environment().from_string(part["command_template"])
+    return str(template.render(value=value, now=lambda: datetime.now(UTC)))
 
 
 # For each platform: the keys that Home Assistant requires, and the optional keys that we use. Source: Home
@@ -639,17 +617,12 @@ def test_registers_named_like_home_assistant_components_get_other_keys() -> None
     assert (parts["works-a-level-set"]["min"], parts["works-a-level-set"]["max"]) == (0, 65535)
     mode = parts["works-a-mode-set"]
     assert (mode["p"], mode["options"]) == ("select", ["SLOW", "FAST"])
-    jinja2 = require_module("jinja2")
-    command = jinja2.Environment().from_string(mode["command_template"])
-    assert json.loads(command.render(value="FAST", now=lambda: datetime.now(UTC)))["value"] == 7
+    assert json.loads(command_of(mode, "FAST"))["value"] == 7
 
 
 def test_a_home_assistant_number_of_an_unpolled_register_has_no_state() -> None:
-    drive = InvtCHE(1, name="a")
-    assert (
-        not {"state_topic", "value_template"}
-        & configured(drive, [], ["setpoint"])["cmps"]["setpoint_set"].keys()
-    )
+    part = configured(InvtCHE(1, name="a"), [], ["setpoint"])["cmps"]["setpoint_set"]
+    assert not {"state_topic", "value_template"} & part.keys()
 
 
 @table(

@@ -177,15 +177,9 @@ def test_a_start_that_a_broker_delivers_after_a_stop_is_refused(tmp_path: Path) 
     require_module("paho.mqtt.client")
     with mosquitto(tmp_path) as broker, served(tmp_path, SERVE.format(broker.address)) as gateway:
         listener = Listener(broker, "multidrop/#")
-        command = [
-            require_program("mosquitto_pub"),
-            "-p",
-            str(broker.port),
-            "-t",
-            "multidrop/pump-1/act",
-            "-l",
-        ]
-        publisher = subprocess.Popen(command, stdin=subprocess.PIPE, text=True)
+        options = ["-p", str(broker.port), "-t", "multidrop/pump-1/act", "-l"]
+        program = require_program("mosquitto_pub")
+        publisher = subprocess.Popen([program, *options], stdin=subprocess.PIPE, text=True)
         assert publisher.stdin
 
         def start() -> None:
