@@ -16,6 +16,8 @@ from tables import table
 
 from multidrop import Batch
 from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout
+from multidrop.polling.added_rows import LONGEST_TEXT, AddedRow, JoinedColumns
+from multidrop.polling.batch import status_code
 from multidrop.samples.message import MOST_ROWS, MessageError, Packed, RowBuffer, unpack, unpacked_size
 
 
@@ -73,6 +75,14 @@ def test_values_are_stored_bit_for_bit() -> None:
     got = unpack(message.data).column("value").to_pylist()
     assert struct.pack(f"{len(numbers)}d", *got) == bytes(batch.columns().value)
     assert got == numbers
+
+
+def test_a_message_with_the_longest_text_of_an_event_is_accepted() -> None:
+    """A character takes up to four bytes in UTF-8. All rows of a message that is not accepted are lost."""
+    text = "\N{MOTOR BOAT}" * LONGEST_TEXT
+    event = AddedRow(UTC_0, 0, 0, 0, 0, status_code(text), 0.0)
+    (message,) = packed(Batch(JoinedColumns(example().parts()[0], [event]), DRIVES, REGISTERS))
+    assert text in unpack(message.data).column("status").to_pylist()
 
 
 @table(("ns", "told"), [(1, 1000), (1000, 1000), (1001, 2000), (3 * 10**12, (2**31 - 1) * 1000)])
@@ -173,8 +183,8 @@ def written(options: pa.ipc.IpcWriteOptions | None = None, **other: pa.Array) ->
         ("register", named("speed", "\0"), "a text in the column register has a NUL character"),
         ("status", named("ok", "o\0k"), "a text in the column status has a NUL character"),
         ("unit", named("Hz", "\0"), "a text in the column unit has a NUL character"),
-        ("drive", named("f" * 1001, "fan"), "a text in the column drive is longer than 1000 bytes"),
-        ("register", named("speed", "ü" * 501), "a text in the column register is longer than 1000 bytes"),
+        ("drive", named("f" * 2001, "fan"), "a text in the column drive is longer than 2000 bytes"),
+        ("register", named("speed", "ü" * 1001), "a text in the column register is longer than 2000 bytes"),
         ("uncertainty_us", pa.array([1, 1 << 31], pa.int64()), "Integer value 2147483648 not in range"),
     ],
 )
@@ -186,7 +196,7 @@ def test_rows_that_no_store_accepts_are_rejected(column: str, rows: pa.Array, sa
 
 def test_a_message_written_by_another_arrow_program_is_accepted() -> None:
     assert rows_of(unpack(written()))[0][3:] == ("fan", "speed", 1.0, "ok", "Hz")
-    assert len(unpack(written(drive=named("ü" * 500, "fan")))) == 2
+    assert len(unpack(written(drive=named("ü" * 1000, "fan")))) == 2
 
 
 def alike(rows: int) -> dict[str, Any]:

@@ -54,7 +54,9 @@ _NOT_COMPRESSED = -1
 MOST_BYTES = 900_000  # size limit of a message; NATS accepts 1 MiB by default, including headers
 MOST_ROWS = 1 << 16
 MOST_UNPACKED = 4 << 20  # limit of the unpacked size in bytes; enough for 2.4 MB of rows and their names
-MOST_NAME = 1000  # limit of a name, status or unit in bytes, because PostgreSQL indexes these texts
+# limit of a name, status or unit in bytes, because PostgreSQL indexes names: an index entry has at most 2704
+# bytes, and the text of an event has at most 500 characters of 4 bytes
+MOST_NAME = 2000
 MOST_SAID = 300  # limit, in characters, of an error's text
 LONGEST_US = (1 << 31) - 1
 COMPRESSED = pa.ipc.IpcWriteOptions(compression=pa.Codec("zstd", 1))
