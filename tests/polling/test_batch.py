@@ -479,6 +479,18 @@ def test_the_wide_form_joins_no_rows_with_different_monotonic_times() -> None:
     assert table.column("pump.a").to_pylist() == [1.0, 2.0]
 
 
+def test_rows_after_a_restart_of_the_computer_are_last_in_the_wide_form() -> None:
+    """A restart sets the monotonic clock to 0. Without a restart, a late miss is sorted by its time."""
+    hour = 3600.0
+    before = [row(at, "pump", "a", at) for at in (hour, hour + 200, hour + 100)]
+    after = [
+        found._replace(time_ns=found.time_ns + 3 * 3600 * SECOND)
+        for found in (row(at, "pump", "a", at) for at in (9.0, 7.0))
+    ]
+    table = pa.table(from_rows([*before, *after]).wide())
+    assert table.column("pump.a").to_pylist() == [hour, hour + 100, hour + 200, 7.0, 9.0]
+
+
 def test_a_miss_is_null_in_the_wide_form_and_replaces_no_value() -> None:
     columns = Columns(4)
     assert add_rows(columns, block(0, 0), completion(SECOND, first_ns=SECOND, words=(100,)), UTC_0)

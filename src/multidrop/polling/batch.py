@@ -68,6 +68,9 @@ def _library(name: str, extra: str, method: str) -> Any:
 
 
 TIMES = ("time", "monotonic_ns")
+# ns; a row belongs to another computer, or to a later start of the computer, if its monotonic time is earlier
+# than that of the row before by more than this, and its offset from UTC differs by more than this
+RESTART_NS = 60_000_000_000
 
 
 class _WideColumn:
@@ -98,7 +101,7 @@ class WideRows(ArrowTable):
     These are the rows of one request, because the registers of a request share the time at which it was sent.
     Other values are not joined, filled or interpolated: a row has values for the registers of one request,
     and null for all others. A miss is also null; only the long form has its reason. Rows are sorted by
-    `monotonic_ns`.
+    `monotonic_ns`, but the rows that follow a restart of the computer stay behind the rows before it.
     """
 
     def __init__(self, rows: Iterable[Row], chosen: Sequence[str] = (), known: Collection[str] = ()) -> None:
@@ -109,9 +112,15 @@ class WideRows(ArrowTable):
         """
         self._columns = {name: _WideColumn() for name in chosen}
         self._times: dict[tuple[int, int], int] = {}  # row numbers by (time, monotonic_ns)
+        self._starts = array("q")  # by row number: the number of restarts of the computer before the row
+        restarts, newest = 0, (0, 0)  # `newest`: time and monotonic time of the newest row since the restart
         found: dict[tuple[str, str], _WideColumn | None] = {}
         owners: dict[str, tuple[str, str]] = {}
         for time, monotonic_ns, _, drive, register, value, _ in rows:
+            if monotonic_ns > newest[1]:
+                newest = time, monotonic_ns
+            elif _is_restarted(newest, (time, monotonic_ns)):
+                restarts, newest = restarts + 1, (time, monotonic_ns)
             owner = drive, register
             if owner not in found:
                 found[owner] = self._column(owner, owners, bool(chosen))
@@ -119,6 +128,8 @@ class WideRows(ArrowTable):
             if column is None:
                 continue
             row = self._times.setdefault((time, monotonic_ns), len(self._times))
+            if row == len(self._starts):
+                self._starts.append(restarts)
             if value is not None:
                 column.rows.append(row)
                 column.values.append(value)
@@ -165,7 +176,8 @@ class WideRows(ArrowTable):
 
     def _arrow(self) -> Any:
         c_array_from_buffers = nanoarrow().c_array_from_buffers
-        ordered = sorted(self._times, key=lambda times: (times[1], times[0]))
+        starts, rows = self._starts, self._times
+        ordered = sorted(rows, key=lambda times: (starts[rows[times]], times[1], times[0]))
         places = array("q", bytes(8 * len(ordered)))
         for place, times in enumerate(ordered):
             places[self._times[times]] = place
@@ -177,6 +189,13 @@ class WideRows(ArrowTable):
             for kind, pair in zip(schema.children, buffers, strict=True)
         ]
         return c_array_from_buffers(schema, len(self), [None], children=children, move=True)
+
+
+def _is_restarted(before: tuple[int, int], now: tuple[int, int]) -> bool:
+    """Return True if the computer was restarted between two rows, given by time and monotonic time."""
+    (time, monotonic_ns), (later, later_monotonic_ns) = before, now
+    is_earlier = later_monotonic_ns < monotonic_ns - RESTART_NS
+    return is_earlier and abs(later - later_monotonic_ns - time + monotonic_ns) > RESTART_NS
 
 
 def _transposed(times: Sequence[tuple[int, int]]) -> Iterable[Iterable[int]]:

@@ -11,6 +11,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 from nats.aio.client import Client
@@ -142,6 +143,26 @@ def kept(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
         assert len(list((folder / "rows").iterdir())) == 2
         assert pq.read_table(*(folder / "tens").glob("00000001-*")).column("unit").null_count
     return folder
+
+
+@pytest.mark.slow
+def test_rows_that_two_gateways_have_polled_are_read_in_the_order_of_time(tmp_path: Path) -> None:
+    """The second gateway has taken over the lines, and was started later, so its monotonic time is lower."""
+    require_module("duckdb")
+    (first,), (second,) = tables(None), tables(None, 40)
+    at = first.schema.get_field_index("monotonic_ns")
+    later = pc.add(first.column(at), 10**15)
+    sink = ParquetSink(tmp_path)
+    both = [first.set_column(at, first.schema.field(at), later), second]
+    sink.write(Commit("made", 1, 2, {"a.x": 1, "b.y": 1}, both, 800))
+    sink.close()
+    with History(tmp_path) as history:
+        rows = history.read(["pump-1.value_1", "pump-2.value_1"])
+        times = [row.time_ns for batch in rows for row in batch]
+        assert times == sorted(times)
+        assert len(times) == 40
+        wide = pa.table(rows.wide()).column("time").cast(pa.int64()).to_pylist()
+    assert wide == times
 
 
 BEGIN, BEFORE, END = NOON, NOON + 18 * STEP, NOON + 120 * STEP
