@@ -1,6 +1,7 @@
 """The operators and functions of channel expressions, with the units and values of their results.
 
-A value that is not known is None. Pure functions then return None. Functions with a memory, such as
+A value that is not known is None. Pure functions then return None, unless the result does not depend on that
+value. Functions with a memory, such as
 `integral`, get each value with the time of its request, and note outages: times without a known value.
 """
 
@@ -117,8 +118,21 @@ def _root_of(value: float) -> Value:
     return sqrt(value) if value >= 0 else None
 
 
-def _chosen(condition: float, then: float, otherwise: float) -> float:
-    return then if condition else otherwise
+def _chosen(condition: Value, then: Value, otherwise: Value) -> Value:
+    """Return the chosen value. The other one may be unknown, as after a division by zero."""
+    return None if condition is None else then if condition else otherwise
+
+
+def _both(one: Value, other: Value) -> Value:
+    if 0.0 in (one, other):  # false, whatever the other one is
+        return 0.0
+    return None if None in (one, other) else 1.0
+
+
+def _either(one: Value, other: Value) -> Value:
+    if one or other:  # true, whatever the other one is
+        return 1.0
+    return None if None in (one, other) else 0.0
 
 
 def _is(compare: Callable[[Any, Any], bool]) -> Callable[[float, float], float]:
@@ -131,6 +145,7 @@ class Function(NamedTuple):
     arities: range
     typed: Callable[[Units], Typed]
     value: Callable[..., Value]
+    takes_unknown: bool = False  # True if `value` may be called with None for an unknown operand
 
 
 FUNCTIONS: dict[str, Function] = {
@@ -145,14 +160,14 @@ FUNCTIONS: dict[str, Function] = {
             *((">=", operator.ge), ("==", operator.eq), ("!=", operator.ne)),
         )
     },
-    "and": Function(range(2, 3), _truth, _is(lambda one, other: bool(one and other))),
-    "or": Function(range(2, 3), _truth, _is(lambda one, other: bool(one or other))),
+    "and": Function(range(2, 3), _truth, _both, takes_unknown=True),
+    "or": Function(range(2, 3), _truth, _either, takes_unknown=True),
     "not": Function(range(1, 2), _truth, lambda value: float(not value)),
     "abs": Function(range(1, 2), _same, abs),
     "sqrt": Function(range(1, 2), _root, _root_of),
     "min": Function(range(2, 131), _as_first, min),
     "max": Function(range(2, 131), _as_first, max),
-    "if": Function(range(3, 4), _choice, _chosen),
+    "if": Function(range(3, 4), _choice, _chosen, takes_unknown=True),
 }
 
 

@@ -98,6 +98,7 @@ class _Applied(NamedTuple):
     value: Any
     arity: int
     factors: tuple[float, ...]
+    takes_unknown: bool = False  # True if the function may be called with None for an unknown operand
 
 
 class _Load(NamedTuple):
@@ -235,7 +236,7 @@ class Program:
         _check_arity(call, function.arities)
         typed = function.typed(units)
         factors = typed.factors if any(factor != 1.0 for factor in typed.factors) else ()
-        self._instructions.append(_Applied(function.value, call.arity, factors))
+        self._instructions.append(_Applied(function.value, call.arity, factors, function.takes_unknown))
         return typed.unit
 
     def _table(self, operands: list[_Operand]) -> ValueUnit:
@@ -298,12 +299,12 @@ class Program:
 
 
 def _applied(step: _Applied, operands: list[Value]) -> Value:
-    known = [operand for operand in operands if operand is not None]
-    if len(known) < len(operands):
+    if not step.takes_unknown and None in operands:
         return None
     if step.factors:
-        known = [value * factor for value, factor in zip(known, step.factors, strict=True)]
-    result: Value = step.value(*known)
+        pairs = zip(operands, step.factors, strict=True)
+        operands = [None if value is None else value * factor for value, factor in pairs]
+    result: Value = step.value(*operands)
     return result
 
 
