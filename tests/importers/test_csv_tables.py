@@ -123,6 +123,12 @@ def test_decimal_of_a_neuron_tag_is_a_factor_and_its_bias_is_added(tmp_path: Pat
     assert (gaps(device, "a"), omissions(device)) == ([], [])
 
 
+@pytest.mark.parametrize("one", ["1", "1.0", "1,0", "1.000"])
+def test_scale_of_one_in_a_csv_table_does_not_hide_a_divisor(tmp_path: Path, one: str) -> None:
+    device = only(tmp_path, "t.csv", f"name;address;type;scale;divisor\na;0x10;uint16;{one};10\n")
+    assert (entries(device)["a"], found(device)) == ({"at": 16, "step": 0.1}, [])
+
+
 def test_second_scale_column_of_a_csv_table_is_marked_as_a_gap(tmp_path: Path) -> None:
     device = row(tmp_path, "address,type,scale,gain", "0x10,uint16,0.1,10")
     assert found(device) == ["its gain 10 was not carried over beside its scale"]
@@ -238,6 +244,13 @@ def test_csv_column_named_register_with_numbers_is_read_as_addresses(tmp_path: P
 def test_lines_above_the_column_names_of_a_csv_table_are_skipped(tmp_path: Path) -> None:
     text = "Meter M-1\nInput registers;;\nName;Address;Type\nvolts;0x10;uint16\n"
     assert entries(only(tmp_path, "t.csv", text))["volts"]["at"] == 16
+
+
+@pytest.mark.parametrize("comma", [",", ";", "\t"])
+def test_the_first_column_of_a_csv_table_may_be_named_number_sign(tmp_path: Path, comma: str) -> None:
+    lines = ["# a comment", "#,Name,Address,Type", "1,volts,0x10,uint16", "#2,amperes,0x11,uint16"]
+    device = only(tmp_path, "t.csv", "\n".join([lines[0], *(one.replace(",", comma) for one in lines[1:])]))
+    assert {name: entry["at"] for name, entry in entries(device).items()} == {"volts": 16}
 
 
 @pytest.mark.parametrize("unit", [0, 255])

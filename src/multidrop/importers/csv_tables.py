@@ -10,6 +10,7 @@ import csv
 import io
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -83,6 +84,7 @@ _SPARE = frozenset(alias for key in ("name", "note", "at") for alias in COLUMNS[
 _VALUE_COLUMNS = GAPS | frozenset(alias for aliases in COLUMNS.values() for alias in aliases) - _SPARE
 _KNOWN = IRRELEVANT | _VALUE_COLUMNS | _SPARE
 _NUMBER = re.compile(r"[0-9]{1,9}")
+_COMMENT = re.compile(r"\s*#(?!\s*[,;\t])")  # start of a comment; a column may have the name #
 _ORDERED = re.compile(r"(u?int(?:16|32|64)|float|double)(be|le|sw|sb)")  # type names of ioBroker
 _BYTES = {"uint8be": "0-7", "uint8le": "8-15", "int8be": "0-7", "int8le": "8-15"}
 _TEXT_ORDERS = {"string": "", "stringle": "BA", "string16": "B"}
@@ -126,7 +128,7 @@ def read_table(text: str, stem: str) -> list[ImportedDevice]:
     """Return the devices of a table. Raises ValueError if the table has no address column or no row."""
     if "\0" in text:
         raise ValueError("has zero bytes; save it as CSV UTF-8")
-    lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    lines = [line for line in text.splitlines() if line.strip() and not _COMMENT.match(line)]
     if not lines:
         raise ValueError("is empty: it has only comments")
     head = lines[0] if re.search("[,;\t]", lines[0]) else "\n".join(lines[:MOST_TITLES])
@@ -300,7 +302,13 @@ def _is_number(cells: Cells) -> bool:
 def _steps(cells: Cells) -> list[tuple[str, str]]:
     """Return the row's cells in scale columns, except scales of 1, with the names of the columns."""
     stated = [(key, cells.get(key, "")) for key in _STEP_COLUMNS]
-    return [(key, cell) for key, cell in stated if cell and (cell != "1" or key == "decimal")]
+    return [(key, cell) for key, cell in stated if cell and (key == "decimal" or not _is_one(cell))]
+
+
+def _is_one(cell: str) -> bool:
+    with suppress(ValueError):
+        return number(cell, 1) == 1
+    return False
 
 
 def _table(register: ImportedRegister, cells: Cells) -> str | None:
