@@ -314,6 +314,15 @@ def test_statistics_of_a_line_cover_the_last_seconds(recent: RecentStatistics) -
     assert recent.line("roof")["rate"] is None
 
 
+@pytest.mark.parametrize("by_s", [-3600, 3600])
+def test_the_last_minute_is_a_minute_although_the_clock_is_set(recent: RecentStatistics, by_s: int) -> None:
+    for second in range(600):
+        utc_s = second + (by_s if second >= 90 else 0)
+        recent.tick(float(second), utc_s * 1000, {"hall": reading(second)})
+    assert recent.line("hall")["misses"] == 3  # of 90 to 120 s
+    assert {one["asked"] for one in recent.hour("hall")[:-1]} == {602}
+
+
 def test_statistics_of_a_line_without_replies_are_none(recent: RecentStatistics, tmp_path: Path) -> None:
     assert recent.line("hall")["misses"] is None
     for second in range(100):

@@ -11,7 +11,7 @@ from multidrop.transport import LineStatistics, Statistics
 
 # in s: time over which a line's use is averaged, and interval of refreshing the figures of the last minute
 SECONDS = 5.0
-MINUTES = 60
+MINUTE_S, MINUTES = 60.0, 60
 
 Reading = Mapping[str, LineStatistics]
 
@@ -27,8 +27,9 @@ class RecentStatistics:
         self._drives: dict[str, dict[str, Any]] = {}
         # by line: figures from the newest reading of the counters
         self._figures: dict[str, dict[str, Any]] = {}
-        # one reading of the counters per minute; only the last two, because readings are large
-        self._minutes: deque[tuple[int, Reading]] = deque(maxlen=2)
+        # one reading of the counters per minute, with its time: monotonic in s, and UTC in ms. Only the last
+        # two, because readings are large.
+        self._minutes: deque[tuple[float, int, Reading]] = deque(maxlen=2)
         # by line: figures of each of the last 60 whole minutes
         self._hours: dict[str, deque[dict[str, Any]]] = {}
         self.adopt(plant)
@@ -43,15 +44,15 @@ class RecentStatistics:
         self._refresh()
 
     def tick(self, now: float, utc_ms: int, reading: Reading) -> None:
-        """Add a reading of the poller's counters; `now` is monotonic time in s."""
+        """Add a reading of the poller's counters; `now` is monotonic time in s, which is never set."""
         self.newest = reading
         self._recent.append((now, reading))
         while now - self._recent[0][0] > SECONDS:
             self._recent.popleft()
-        if not self._minutes or utc_ms - self._minutes[-1][0] >= 60_000:
+        if not self._minutes or now - self._minutes[-1][0] >= MINUTE_S:
             for line in reading:
                 self._hours.setdefault(line, deque(maxlen=MINUTES)).extend(self._this_minute(line))
-            self._minutes.append((utc_ms, reading))
+            self._minutes.append((now, utc_ms, reading))
         is_complete = reading.keys() == self._minute.keys() and None not in self._minute.values()
         if now >= self._due or not is_complete:
             self._due = now + SECONDS
@@ -105,7 +106,7 @@ class RecentStatistics:
 
     def _last_minute(self, line: str) -> LineStatistics | None:
         """Return a line's statistics over the last one to two minutes; None without an earlier reading."""
-        earlier = self._minutes[max(-2, -len(self._minutes))][1] if self._minutes else {}
+        earlier = self._minutes[max(-2, -len(self._minutes))][2] if self._minutes else {}
         return self._since(earlier, line)
 
     def _since(self, earlier: Reading, name: str) -> LineStatistics | None:
@@ -125,7 +126,7 @@ class RecentStatistics:
 
     def _this_minute(self, line: str) -> list[dict[str, Any]]:
         """Return the figures of the current minute; an empty list if it has just started."""
-        begin_ms, before = self._minutes[-1] if self._minutes else (0, {})
+        _, begin_ms, before = self._minutes[-1] if self._minutes else (0.0, 0, {})
         minute = self._since(before, line)
         return [{"time": begin_ms, "asked": asked_of(minute), "misses": misses_of(minute)}] if minute else []
 
