@@ -21,7 +21,7 @@ from terminals import Terminal, on_terminal
 
 from multidrop.cli.monitor import PAGE, Monitor, pause_s
 from multidrop.cli.monitor_screen import LEAST_HEIGHT, LEAST_WIDTH, Position, SideRead, overview, page
-from multidrop.cli.support.polling import LivePlant, PollingSession, Triggering
+from multidrop.cli.support.polling import LivePlant, Moment, PollingSession, Triggering
 from multidrop.cli.support.signals import Interruption
 from multidrop.cli.support.terminal import (
     BLOCKS,
@@ -60,6 +60,10 @@ def a_plant(tmp_path: Path, drives: int = 3) -> Plant:
         )
     path.write_text(text)
     return load_plant(path)
+
+
+def after(ns: int) -> Moment:
+    return Moment(NOW + ns, NOW + ns)
 
 
 def row(drive: str, register: str, value: float | None, status: str = "ok", ago: float = 0.5) -> Row:
@@ -116,7 +120,7 @@ def test_the_monitor_derives_a_drives_state_from_polled_registers(watched: LiveP
         ("fault", "oc1_overcurrent_accelerating", ""),
         ("silent", "", "no reply"),
     ]
-    assert [drive.age(NOW) for drive in watched.drives] == [0.5, 9.0, None]
+    assert [drive.age(after(0)) for drive in watched.drives] == [0.5, 9.0, None]
     assert [drive.so_far.misses.total() for drive in watched.drives] == [12, 0, 0]
 
 
@@ -179,7 +183,7 @@ def test_the_monitors_history_has_values_of_one_register_only(tmp_path: Path) ->
 
 
 def test_the_overview_shows_states_in_words(watched: LivePlant) -> None:
-    lines = texts(overview(watched, Position(), (80, 24), NOW, BLOCKS))
+    lines = texts(overview(watched, Position(), (80, 24), after(0), BLOCKS))
     assert lines[0].startswith(" multidrop monitor  hall.toml")
     assert lines[0].endswith("09:30:00 UTC ")
     assert lines[1].startswith(" hall-1   90% of the wire used  50.0 exchanges/s  12 missed: bad checksum")
@@ -197,7 +201,7 @@ def test_an_old_value_is_marked_if_other_values_are_new(watched: LivePlant) -> N
         drive.cycle = 1.0  # in s; a value is current for three such cycles
     watched.add(from_rows([row("drive-1", "output_frequency", None, "exception 02", ago=0)]))
     at = Position()
-    shown = [texts(overview(watched, at, (80, 24), NOW + wait, BLOCKS))[3] for wait in (0, SECOND)]
+    shown = [texts(overview(watched, at, (80, 24), after(wait), BLOCKS))[3] for wait in (0, SECOND)]
     assert [" 42.50 Hz " in line for line in shown] == [True, False]  # one miss does not make a value old
     assert shown[1].split()[1:8] == ["running", "?42.50", "Hz", "2.5", "A", "1.5", "s"]
 
@@ -209,16 +213,24 @@ def test_a_slowly_polled_value_is_current_for_three_periods(tmp_path: Path) -> N
     plant = load_plant(path)
     (drive,) = LivePlant(plant).drives
     drive.add(row("drive-1", "output_frequency", 42.5))
-    ages = [drive.is_old("output_frequency", NOW + seconds * SECOND) for seconds in (100, 170, 190)]
+    ages = [drive.is_old("output_frequency", after(seconds * SECOND)) for seconds in (100, 170, 190)]
     assert ages == [False, False, True]
     # the line has so many drives that a bus cycle takes 100 s
     planned = plant.metadata()["planned"] | {"hall-1": {"cycle_ms": 100_000.0}}
     (drive,) = LivePlant(plant, planned).drives
     drive.add(row("drive-1", "output_frequency", 42.5))
-    assert [drive.is_old("output_frequency", NOW + seconds * SECOND) for seconds in (290, 310)] == [
+    assert [drive.is_old("output_frequency", after(seconds * SECOND)) for seconds in (290, 310)] == [
         False,
         True,
     ]
+
+
+def test_an_old_value_is_marked_although_the_clock_is_set_back(watched: LivePlant) -> None:
+    now = Moment(NOW - 3600 * SECOND, NOW + 100 * SECOND)
+    (first, *_) = watched.drives
+    assert (first.age(now), first.is_old("output_frequency", now)) == (100.5, True)
+    slept = Moment(NOW + 3600 * SECOND, NOW)  # CLOCK_MONOTONIC has stopped for an hour
+    assert (first.age(slept), first.is_old("output_frequency", slept)) == (3600.5, True)
 
 
 def test_reads_of_unpolled_registers_take_at_most_5_percent_of_a_lines_time(tmp_path: Path) -> None:
@@ -247,12 +259,12 @@ def test_monitor_pictures_fit_every_terminal_size(tmp_path: Path, size: tuple[in
             Position(chosen, question="Leave?", failures=["x" * 5000]),
         ):
             for lines in (
-                overview(live, at, size, NOW, BLOCKS),
-                page(live.drives[chosen], {}, at, size, NOW),
+                overview(live, at, size, after(0), BLOCKS),
+                page(live.drives[chosen], {}, at, size, after(0)),
             ):
                 assert len(lines) == size[1]
                 assert max(len(line) for line in texts(lines)) <= size[0]
-        shown = texts(overview(live, Position(chosen), size, NOW, BLOCKS))
+        shown = texts(overview(live, Position(chosen), size, after(0), BLOCKS))
         assert any(line.startswith(f">drive-{chosen + 1} ") for line in shown)
 
 
@@ -261,33 +273,33 @@ def test_the_narrowest_picture_shows_the_age_and_all_keys(tmp_path: Path, name: 
     live = LivePlant(a_plant(tmp_path, 1))
     live.drives[0].polled.drive.name = name
     size = LEAST_WIDTH, LEAST_HEIGHT
-    shown = texts(overview(live, Position(), size, NOW, BLOCKS))
+    shown = texts(overview(live, Position(), size, after(0), BLOCKS))
     assert shown[2].split()[-1] == "AGE"
     assert shown[3].rstrip().endswith(" never")
     assert columns_of(shown[3]) <= LEAST_WIDTH
     # the age is right-aligned below its heading
     assert columns_of(shown[3].rstrip()) == len(shown[2].rstrip())
-    for lines in (shown, texts(page(live.drives[0], {}, Position(), size, NOW))):
+    for lines in (shown, texts(page(live.drives[0], {}, Position(), size, after(0)))):
         assert lines[-1].endswith("s stop   S stop all   q quit")
 
 
 def test_no_heading_of_the_overview_is_cut(watched: LivePlant) -> None:
     widths = range(LEAST_WIDTH, 160)
-    headings = [texts(overview(watched, Position(), (width, 24), NOW, BLOCKS))[2] for width in widths]
+    headings = [texts(overview(watched, Position(), (width, 24), after(0), BLOCKS))[2] for width in widths]
     assert [heading for heading in headings if "~" in heading] == []
 
 
 def test_a_wide_overview_shows_long_names_in_full(tmp_path: Path) -> None:
     live = LivePlant(a_plant(tmp_path, 1))
     live.drives[0].polled.drive.name = name = "conveyor-of-the-bottling-hall-south-12"
-    assert texts(overview(live, Position(), (200, 50), NOW, BLOCKS))[3].split()[0] == f">{name}"
+    assert texts(overview(live, Position(), (200, 50), after(0), BLOCKS))[3].split()[0] == f">{name}"
 
 
 def test_the_overview_shows_the_last_trigger_if_it_has_room(watched: LivePlant) -> None:
     curves = [f"a.{name}  __##  0 to 4 A" for name in "iuft"] + ["       ^ from -1 s to 2 s"]
     at = Position(trigger=curves)
     for height, shown in ((13, curves), (12, [])):
-        lines = texts(overview(watched, at, (80, height), NOW, BLOCKS))
+        lines = texts(overview(watched, at, (80, height), after(0), BLOCKS))
         assert len(lines) == height
         assert [line[1:] for line in lines[6:-2] if line.strip()] == shown
         assert all(any(drive.name in line for line in lines) for drive in watched.drives)
@@ -296,7 +308,7 @@ def test_the_overview_shows_the_last_trigger_if_it_has_room(watched: LivePlant) 
 def test_the_page_of_a_drive_shows_every_register(watched: LivePlant) -> None:
     live = watched.drives[1]
     others = {"motor_speed": SideRead("0 rpm", NOW - 14 * SECOND)}
-    lines = texts(page(live, others, Position(1, page=True), (80, 40), NOW))
+    lines = texts(page(live, others, Position(1, page=True), (80, 40), after(0)))
     assert lines[0].startswith(" drive-2  INVT CHE  address 2  9600 8N1 rtu")
     rows = {line.split()[0]: line for line in lines[3:-2] if line.strip()}
     readable = {name for name, register in live.polled.drive.registers.items() if register.readable}
@@ -310,7 +322,7 @@ def test_the_page_of_a_drive_shows_every_register(watched: LivePlant) -> None:
 def test_the_page_of_a_drive_shows_whole_reasons_if_values_are_short(watched: LivePlant) -> None:
     why = "not asked: drive is silent"
     watched.add(from_rows([row("drive-1", name, None, why) for name in CHE]))
-    lines = texts(page(watched.drives[0], {}, Position(page=True), (80, 24), NOW))
+    lines = texts(page(watched.drives[0], {}, Position(page=True), (80, 24), after(0)))
     assert [line.endswith(why) for line in lines[3:7]] == [True] * 4
 
 
@@ -318,28 +330,28 @@ def test_the_page_of_a_drive_shows_whole_reasons_if_values_are_short(watched: Li
     ("seconds", "age"), [(9, "9.5 s"), (50, "50 s"), (600, "10 min"), (7199, "120 min"), (36000, "10 h")]
 )
 def test_the_monitor_shows_ages_in_readable_units(watched: LivePlant, seconds: int, age: str) -> None:
-    lines = texts(overview(watched, Position(), (80, 24), NOW + seconds * SECOND, BLOCKS))
+    lines = texts(overview(watched, Position(), (80, 24), after(seconds * SECOND), BLOCKS))
     assert " ".join(lines[3].split()[6:8]) == age
 
 
 def test_a_wide_overview_shows_response_delays(watched: LivePlant) -> None:
-    lines = texts(overview(watched, Position(), (200, 50), NOW, BLOCKS))
+    lines = texts(overview(watched, Position(), (200, 50), after(0), BLOCKS))
     assert lines[2].split()[-3:] == ["DELAY", "LAST", "MINUTE"]
     assert " 8.9 ms " in lines[3]
     assert " ms " not in lines[4]
 
 
 def test_the_page_of_a_drive_shows_its_response_delays(watched: LivePlant) -> None:
-    lines = texts(page(watched.drives[0], {}, Position(0, page=True), (100, 40), NOW))
+    lines = texts(page(watched.drives[0], {}, Position(0, page=True), (100, 40), after(0)))
     assert lines[1] == " running      12 missed: bad checksum 9, no reply 3"
     assert lines[2] == " 50.0 exchanges/s  delay 8.9 ms, p99 8.9, max 31.0  2 late  17 bytes skipped"
-    silent = texts(page(watched.drives[2], {}, Position(2, page=True), (100, 40), NOW))
+    silent = texts(page(watched.drives[2], {}, Position(2, page=True), (100, 40), after(0)))
     assert silent[2] == " 0.0 exchanges/s"
 
 
 def test_the_page_of_a_drive_scrolls_to_its_last_row(watched: LivePlant) -> None:
     at = Position(0, page=True, scrolled=1000)
-    lines = texts(page(watched.drives[0], {}, at, (80, 12), NOW))
+    lines = texts(page(watched.drives[0], {}, at, (80, 12), after(0)))
     assert lines[9].strip()
     registers = watched.drives[0].polled.drive.registers.values()
     assert f"of {len([register for register in registers if register.readable])}" in lines[-2]
@@ -491,7 +503,7 @@ def test_hidden_failures_of_stops_are_shown_once_visible_ones_are_acknowledged(w
     at = Position(failures=[f"drive-{number}: no reply" for number in range(31)])
     shown: list[str] = []
     for more in (24, 17, 10, 3, 0):
-        lines = texts(overview(watched, at, (80, 24), NOW, BLOCKS))
+        lines = texts(overview(watched, at, (80, 24), after(0), BLOCKS))
         told = [line.strip(" !") for line in lines if line.startswith(" ! drive-")]
         assert any(f"... and {more} more; acknowledge these" in line for line in lines) == bool(more)
         shown += told

@@ -22,6 +22,7 @@ from multidrop.cli.support.polling import (
     POINT_S,
     LiveDrive,
     LivePlant,
+    Moment,
     PollingSession,
     Triggering,
     add_trigger_arguments,
@@ -48,6 +49,7 @@ from multidrop.plant.model import Plant
 from multidrop.poller import Poller
 from multidrop.polling.added_rows import TRIGGER
 from multidrop.recording.triggered import TriggeredWriter
+from multidrop.transport import clock
 
 DRAW_S = 0.25
 SCROLL_S = 2.0  # s between two pictures on a terminal without cursor control
@@ -190,11 +192,11 @@ class Monitor:
         return any(thread.is_alive() for thread in self._stops)
 
     def _picture(self) -> Sequence[TextLine]:
-        size, now_ns = self._screen.size, time.time_ns()
+        size, now = self._screen.size, Moment(time.time_ns(), clock.now_ns())
         if self._at.page:
             others = self._side_reader.read(self._chosen)
-            return page(self._chosen, others, self._at, size, now_ns)
-        return overview(self._plant, self._at, size, now_ns, self._screen.blocks)
+            return page(self._chosen, others, self._at, size, now)
+        return overview(self._plant, self._at, size, now, self._screen.blocks)
 
     @property
     def _chosen(self) -> LiveDrive:
@@ -393,7 +395,7 @@ class SideReader:
                 text = value_text(register, drive.read(register))
             except BusError as failure:
                 text = _in_words(failure)
-            found[name] = SideRead(text, time.time_ns())
+            found[name] = SideRead(text, clock.now_ns())
             time.sleep(pause_s(time.monotonic() - asked, chosen.line_utilisation))
 
 

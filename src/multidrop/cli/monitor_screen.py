@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import NamedTuple
 
-from multidrop.cli.support.polling import CURRENT, FAULT, FREQUENCY, STATE, LiveDrive, LivePlant
+from multidrop.cli.support.polling import CURRENT, FAULT, FREQUENCY, STATE, LiveDrive, LivePlant, Moment
 from multidrop.cli.support.terminal import TextLine, cut, filled, sparkline
 from multidrop.cli.support.values import columns_of, counted, padded
 from multidrop.printable import printable
@@ -51,15 +51,15 @@ class SideRead(NamedTuple):
     """One read of a register: the value as text, or why the read failed."""
 
     text: str
-    time: int  # end of the read, UTC in ns
+    monotonic_ns: int  # end of the read
 
 
 def overview(
-    plant: LivePlant, at: Position, size: tuple[int, int], now_ns: int, blocks: str
+    plant: LivePlant, at: Position, size: tuple[int, int], now: Moment, blocks: str
 ) -> list[TextLine]:
     """Draw one line of text per drive. If not all drives fit, draw those around the chosen drive."""
     width, height = size
-    top = [_title(plant, width, now_ns), *_line_states(plant, width)]
+    top = [_title(plant, width, now), *_line_states(plant, width)]
     columns = _columns(plant, width)
     top.append(TextLine(_row(columns, {name: name for name in columns}, "")[:width], style="bold underline"))
     alarms = _alarms(at, size)
@@ -70,7 +70,7 @@ def overview(
     room -= len(curves)
     first = max(0, min(at.chosen - room // 2, len(plant.drives) - room))
     rows = [
-        _drive(drive, number == at.chosen, columns, width, now_ns, blocks)
+        _drive(drive, number == at.chosen, columns, width, now, blocks)
         for number, drive in enumerate(plant.drives[first : first + room], first)
     ]
     hidden = len(plant.drives) - len(rows)
@@ -81,7 +81,7 @@ def overview(
 
 
 def page(
-    shown: LiveDrive, others: Mapping[str, SideRead], at: Position, size: tuple[int, int], now_ns: int
+    shown: LiveDrive, others: Mapping[str, SideRead], at: Position, size: tuple[int, int], now: Moment
 ) -> list[TextLine]:
     """Draw every register of one drive.
 
@@ -101,7 +101,7 @@ def page(
     polled = [poll.register.name for poll in shown.polled.series]
     names = [*polled, *(name for name in names if name not in polled)]
     longest = max(map(len, names), default=0)
-    cells = [_register(shown, name, others, now_ns) for name in names]
+    cells = [_register(shown, name, others, now) for name in names]
     notes = max((len(note) for *_, note in cells), default=0)
     room = max(LEAST_VALUE, width - longest - notes - AROUND)  # columns that remain for registers' values
     values = max(LEAST_VALUE, min(room, max((columns_of(value) for value, *_ in cells), default=0)))
@@ -126,8 +126,8 @@ def page(
 # ---- parts of both pictures ----
 
 
-def _title(plant: LivePlant, width: int, now_ns: int) -> TextLine:
-    clock = f"{datetime.fromtimestamp(now_ns / 1e9, UTC):%H:%M:%S} UTC "
+def _title(plant: LivePlant, width: int, now: Moment) -> TextLine:
+    clock = f"{datetime.fromtimestamp(now.utc_ns / 1e9, UTC):%H:%M:%S} UTC "
     text = f" multidrop monitor  {printable(plant.plant.path.name)}"
     return TextLine(filled(text, width - len(clock)) + clock, style="reverse")
 
@@ -200,9 +200,9 @@ def _row(columns: Mapping[str, int], cells: Mapping[str, str], mark: str) -> str
 
 
 def _drive(
-    drive: LiveDrive, chosen: bool, columns: Mapping[str, int], width: int, now_ns: int, blocks: str
+    drive: LiveDrive, chosen: bool, columns: Mapping[str, int], width: int, now: Moment, blocks: str
 ) -> TextLine:
-    old = {name for name in (STATE, FREQUENCY, CURRENT, FAULT) if drive.is_old(name, now_ns)}
+    old = {name for name in (STATE, FREQUENCY, CURRENT, FAULT) if drive.is_old(name, now)}
 
     def marked(text: str, register: str) -> str:
         return OLD + text if text and register in old else text
@@ -214,7 +214,7 @@ def _drive(
         "FREQUENCY": marked(drive.shown(FREQUENCY), FREQUENCY),
         "CURRENT": marked(drive.shown(CURRENT), CURRENT),
         "FAULT": marked(drive.fault, FAULT) or drive.why_silent,
-        "AGE": _age(drive.age(now_ns)),
+        "AGE": _age(drive.age(now)),
         "DELAY": f"{_ms(drive.so_far.delays.p50)} ms" if drive.so_far.delays.replies else "",
         "MISSED": str(drive.so_far.misses.total() or ""),
         HISTORY: sparkline(drive.history, columns.get(HISTORY, 0), blocks, drive.points),
@@ -225,17 +225,19 @@ def _drive(
 
 
 def _register(
-    drive: LiveDrive, name: str, others: Mapping[str, SideRead], now_ns: int
+    drive: LiveDrive, name: str, others: Mapping[str, SideRead], now: Moment
 ) -> tuple[str, str, str]:
     """Return a register's value, its age, and a note."""
     if any(poll.register.name == name for poll in drive.polled.series):
         miss = drive.missed.get(name)
         row = drive.newest.get(name)
         value = drive.shown(name) or (miss.status if miss else "not yet")
-        note = miss.status if miss and row else OLD_NOTE if drive.is_old(name, now_ns) else ""
-        return value, _age(None if row is None else (now_ns - row.time_ns) / 1e9), note
+        note = miss.status if miss and row else OLD_NOTE if drive.is_old(name, now) else ""
+        return value, _age(None if row is None else now.age(row)), note
     other = others.get(name)
-    return (other.text, _age((now_ns - other.time) / 1e9), NOT_POLLED) if other else ("...", "", NOT_POLLED)
+    if other is None:
+        return "...", "", NOT_POLLED
+    return other.text, _age((now.monotonic_ns - other.monotonic_ns) / 1e9), NOT_POLLED
 
 
 def _register_row(name: str, value: str, age: str, note: str, value_width: int, width: int) -> TextLine:

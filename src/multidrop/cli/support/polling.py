@@ -112,6 +112,20 @@ FREQUENCY, CURRENT, FAULT, STATE = "output_frequency", "output_current", "fault"
 _NOTHING = Statistics(1.0, Counters())
 
 
+class Moment(NamedTuple):
+    """One moment in UTC and by CLOCK_MONOTONIC, both in ns."""
+
+    utc_ns: int
+    monotonic_ns: int
+
+    def age(self, row: Row) -> float:
+        """Return the time in s since a row's request: the larger of the times by both clocks.
+
+        UTC may be set back, and CLOCK_MONOTONIC stops while the computer sleeps. Both make an age too small.
+        """
+        return max(self.utc_ns - row.time_ns, self.monotonic_ns - row.monotonic_ns, 0) / 1e9
+
+
 @dataclass
 class LiveDrive:
     """A polled drive: its newest values, its misses, its statistics and a history."""
@@ -151,16 +165,15 @@ class LiveDrive:
             return ""
         return value_text(self.polled.find_register(name), row.value)
 
-    def age(self, now_ns: int) -> float | None:
+    def age(self, now: Moment) -> float | None:
         """Return how old the newest sample is, in s; None without any sample."""
         polled = (self.newest.get(poll.register.name) for poll in self.polled.polls)
-        newest = max((row.time_ns for row in polled if row), default=None)
-        return None if newest is None else max(0.0, (now_ns - newest) / 1e9)
+        return min((now.age(row) for row in polled if row), default=None)
 
-    def is_old(self, name: str, now_ns: int) -> bool:
+    def is_old(self, name: str, now: Moment) -> bool:
         """Return True if a register's newest value is no longer current."""
         row = self.newest.get(name)
-        age = 0.0 if row is None else (now_ns - row.time_ns) / 1e9
+        age = 0.0 if row is None else now.age(row)
         every = next((poll.every for poll in self.polled.series if poll.register.name == name), None)
         return age > (MISSED if name in self.missed else current_for(max(every or 0.0, self.cycle)))
 
@@ -169,7 +182,7 @@ class LiveDrive:
         """If the last request for every polled register failed, return why; else ""."""
         if any(poll.register.name not in self.missed for poll in self.polled.polls) or not self.missed:
             return ""
-        return self.last_miss or max(self.missed.values(), key=lambda row: row.time_ns).status
+        return self.last_miss or max(self.missed.values(), key=lambda row: row.monotonic_ns).status
 
     @property
     def fault(self) -> str:
