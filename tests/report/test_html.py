@@ -182,8 +182,15 @@ REGISTERS = {
 }
 
 
-def recorded_run(path: Path) -> None:
-    """Record 25 s of three registers at irregular times; one value in twenty is missed."""
+def recorded_run(path: Path, set_by_s: float = 0.0) -> None:
+    """Record 25 s of three registers at irregular times; one value in twenty is missed.
+
+    After 10 s, the clock is set by `set_by_s`.
+    """
+
+    def utc(at: int) -> int:
+        return UTC_0 + at + (round(set_by_s * SECOND) if at >= 10 * SECOND else 0)
+
     chance = random.Random(5)
     rows, seconds = [], 0.0
     while seconds < 25:
@@ -193,12 +200,12 @@ def recorded_run(path: Path) -> None:
         for name, value in (("output_frequency", level), ("output_power", level**2 / 100), ("fault", 0.0)):
             is_missed = chance.random() < 0.05
             sample = (None, None, "no reply") if is_missed else (0, value + chance.gauss(0, 0.002), "ok")
-            rows.append(Row(UTC_0 + at, at, sample[0], "pump", name, sample[1], sample[2]))
+            rows.append(Row(utc(at), at, sample[0], "pump", name, sample[1], sample[2]))
     about: dict[str, Any] = {"drives": {"pump": {"registers": REGISTERS}}}
     with open_writer(path, with_phases(about, ["one", "two", "stop"])) as writer:
         for number, edge in enumerate(EDGES):
             at = round(edge * SECOND)
-            writer.write(phase_row(number, UTC_0 + at, at))
+            writer.write(phase_row(number, utc(at), at))
         writer.write(from_rows(rows))
 
 
@@ -240,6 +247,16 @@ def test_figures_of_a_step_equal_those_computed_with_pandas(tmp_path: Path) -> N
     (first, _) = values_of(recording, recording.steps[0])
     # a first-order step with the time constant 0.4 s
     assert first.settling == pytest.approx(0.4 * math.log(50), abs=0.3)
+
+
+@pytest.mark.parametrize("set_by_s", [-3600.0, -3.0, 3600.0])
+def test_figures_of_a_step_do_not_change_if_the_clock_is_set(tmp_path: Path, set_by_s: float) -> None:
+    recorded_run(tmp_path / "run.arrows")
+    recorded_run(tmp_path / "set.arrows", set_by_s)
+    run, other = load(tmp_path / "run.arrows"), load(tmp_path / "set.arrows")
+    assert [step.what for step in other.steps] == ["one", "two", "stop"]
+    for step, same in zip(run.steps, other.steps, strict=True):
+        assert values_of(other, same) == values_of(run, step)
 
 
 @pytest.mark.slow

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ from multidrop.recording.series import (
     unit_of_register,
 )
 
+NUMBERS = ("time", "monotonic_ns", "value", "uncertainty_ns")  # columns of numbers
 LARGEST = 1e150  # larger values are not drawn, because matplotlib multiplies values
 # rows are a pause apart if their interval exceeds PAUSE_NS, and PAUSE_STEPS times both neighbouring intervals
 PAUSE_NS, PAUSE_STEPS = 2 * 10**9, 5
@@ -45,13 +47,22 @@ class TimeSpan:
     what: str
 
 
+@dataclass(frozen=True)
+class StepSpan(TimeSpan):
+    """The time of a step of a test run, also in ns of CLOCK_MONOTONIC, which is never set."""
+
+    monotonic_begin: int
+    monotonic_end: int
+
+
 @dataclass(frozen=True, eq=False)
 class Series:
-    """The rows of one register of one drive; `value` is NaN for a miss."""
+    """The rows of one register of one drive, sorted by `time`; `value` is NaN for a miss."""
 
     drive: str
     register: str
     time: Array  # times of the rows: int64, ns UTC
+    monotonic: Array  # the same times in ns of CLOCK_MONOTONIC
     value: Array  # float64
     uncertainty: Array  # float64, ns
     status: Array  # each row's status, as an index into `statuses`
@@ -140,7 +151,7 @@ class Recording:
     metadata: Mapping[str, Any]
     series: tuple[Series, ...]
     truncated: int  # number of skipped bytes at the recording's end
-    steps: tuple[TimeSpan, ...] = ()  # steps of a test run, each with its phase's name
+    steps: tuple[StepSpan, ...] = ()  # steps of a test run, each with its phase's name
     events: tuple[Event, ...] = ()  # in the order of their times
 
     @property
@@ -204,7 +215,7 @@ def load(path: str | Path) -> Recording:
     for batch in reader:
         children = dict(zip(ROW_COLUMNS, batch.arrow().view().children, strict=True))
         columns = [codes_of(children[name], known) for name, known in codes.items()]
-        parts.append(columns + [numbers_of(children[name]) for name in ("time", "value", "uncertainty_ns")])
+        parts.append(columns + [numbers_of(children[name]) for name in NUMBERS])
         rows += len(batch)
         if rows > MOST_ROWS:
             raise ValueError(f"{path} is too large to draw: it has more than {MOST_ROWS} rows")
@@ -217,7 +228,7 @@ def load(path: str | Path) -> Recording:
             "it ends within the first one" if reader.truncated else "nothing was polled while it was recorded"
         )
         raise ValueError(f"{path} holds no rows: {why}")
-    drive, register, status, time, value, uncertainty = (
+    drive, register, status, time, monotonic, value, uncertainty = (
         np.concatenate(column) for column in zip(*parts, strict=True)
     )
     if not 0 <= time.min() <= time.max() < LATEST_NS:
@@ -233,6 +244,7 @@ def load(path: str | Path) -> Recording:
                 drive_name,
                 register_name,
                 time[rows_of],
+                monotonic[rows_of],
                 value[rows_of].astype(float),
                 uncertainty[rows_of].astype(float),
                 status[rows_of],
@@ -245,7 +257,8 @@ def load(path: str | Path) -> Recording:
     if not polled:
         raise ValueError(f"{path} holds no rows of drives, but only events or the phases of a test run")
     phases = [one for one in series if one.drive == PHASE_DRIVE and one not in polled]
-    steps = [step for one in phases for step in _steps(one, int(time.max()) + 1)]
+    end = int(time.max()) + 1, int(monotonic.max()) + 1
+    steps = [step for one in phases for step in _steps(one, end)]
     events = {event for one in series if one.drive == EVENT for event in _events(one)}
     if trigger := trigger_of(metadata):
         events.add(trigger)
@@ -253,11 +266,18 @@ def load(path: str | Path) -> Recording:
     return Recording(Path(path), metadata, polled, reader.truncated, tuple(steps), tuple(in_order))
 
 
-def _steps(phases: Series, end: int) -> list[TimeSpan]:
-    """Return the steps of a test run. Each ends at the next step, or at the recording's end."""
-    begins = phases.time.tolist()
-    names = map(phases.name_of, phases.value.tolist())
-    return [TimeSpan(*span) for span in zip(begins, [*begins[1:], end], names, strict=True)]
+def _steps(phases: Series, end: tuple[int, int]) -> list[StepSpan]:
+    """Return the steps of a test run. Each ends at the next step, or at the recording's end `end`.
+
+    `end` is in ns UTC, and in ns of CLOCK_MONOTONIC.
+    """
+    in_order = np.argsort(phases.monotonic, kind="stable")
+    names = map(phases.name_of, phases.value[in_order].tolist())
+    utc, monotonic = (
+        pairwise([*times[in_order].tolist(), last])
+        for times, last in zip((phases.time, phases.monotonic), end, strict=True)
+    )
+    return [StepSpan(*span, name, *same) for span, name, same in zip(utc, names, monotonic, strict=True)]
 
 
 def _events(series: Series) -> list[Event]:

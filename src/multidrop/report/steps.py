@@ -1,4 +1,7 @@
-"""Compute figures of a test run's steps: means, extremes, settling times, slopes and energies."""
+"""Compute figures of a test run's steps: means, extremes, settling times, slopes and energies.
+
+All durations are by CLOCK_MONOTONIC, because UTC may be set during a run.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from multidrop.recording.series import Array
-from multidrop.report.load import Recording, Series, TimeSpan
+from multidrop.report.load import Recording, Series, StepSpan
 
 BAND = 0.02  # a value is settled if it differs from the settled value by at most this fraction of its change
 LAST = 0.2  # the settled value is the mean over this last fraction of a step
@@ -37,20 +40,22 @@ class StepValues(NamedTuple):
     energy: float | None
 
 
-def values_of(recording: Recording, step: TimeSpan) -> list[StepValues]:
+def values_of(recording: Recording, step: StepSpan) -> list[StepValues]:
     """Return the figures of this step for each register that has numbers, not names."""
     found = (_values_of(series, step) for series in recording.series if not series.names)
     return [values for values in found if values is not None]
 
 
-def _values_of(series: Series, step: TimeSpan) -> StepValues | None:
-    rows = slice(*np.searchsorted(series.time, [step.begin, step.end]))
-    known = ~series.missed[rows]
-    value = series.value[rows][known]
+def _values_of(series: Series, step: StepSpan) -> StepValues | None:
+    in_order = np.argsort(series.monotonic, kind="stable")
+    times, values = series.monotonic[in_order], series.value[in_order]
+    begin, end = np.searchsorted(times, [step.monotonic_begin, step.monotonic_end])
+    seconds = (times[begin:end] - step.monotonic_begin) / 1e9
+    known = ~np.isnan(values)
+    time, value = seconds[known[begin:end]], values[begin:end][known[begin:end]]
     if not len(value):
         return None
-    time = (series.time[rows][known] - step.begin) / 1e9
-    before = series.value[: rows.start][~series.missed[: rows.start]]
+    before = values[:begin][known[:begin]]
     first = float(before[-1]) if len(before) else float(value[0])
     return StepValues(
         series.drive,
@@ -62,7 +67,7 @@ def _values_of(series: Series, step: TimeSpan) -> StepValues | None:
         float(value.max()),
         _settling(time, value, first, float(series.metadata.get("step") or 0.0)),
         _slope(time, value),
-        _energy(series, rows, step),
+        _energy(series.unit, seconds, values[begin:end]),
     )
 
 
@@ -84,9 +89,8 @@ def _slope(time: Array, value: Array) -> float | None:
     return float((from_mean * (value - value.mean())).sum()) / spread if spread else None
 
 
-def _energy(series: Series, rows: slice, step: TimeSpan) -> float | None:
-    if series.unit not in KILOWATTS:
+def _energy(unit: str, seconds: Array, values: Array) -> float | None:
+    if unit not in KILOWATTS:
         return None
-    hours = (series.time[rows] - step.begin) / 3.6e12
-    power = series.value[rows] * KILOWATTS[series.unit]
-    return float(np.nansum(np.diff(hours) * (power[1:] + power[:-1]) / 2))
+    power = values * KILOWATTS[unit]
+    return float(np.nansum(np.diff(seconds) / 3600 * (power[1:] + power[:-1]) / 2))
