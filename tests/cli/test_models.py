@@ -296,7 +296,7 @@ def test_models_prints_every_register_of_a_family_as_json(run: Run) -> None:
             [
                 "b.010 address (1 from the factory), set while the motor stands",
                 "remote b.001 must be 2 and b.002 5 (RS-485)",
-                "broadcast the manual calls address 0 one, and does not say that nobody answers: none",
+                "broadcast the manual does not say whether drives reply to address 0, so none is sent",
                 "coils (read 01H, at most 12; write 05H)",
                 "only verbs write it, except ON",
                 "(0 to 4294967295)",
@@ -339,7 +339,7 @@ def test_models_prints_every_register_of_a_family_as_json(run: Run) -> None:
                 "at least minimum_frequency; at most maximum_frequency",
                 "except COMMAND_VALID|FREQUENCY_VALID, COMMAND_VALID,",
                 "never together: RESET and RUN, RESET and JOG",
-                "what it is from the factory is not stated",
+                "the factory value is not stated",
             ],
         ),
     ],

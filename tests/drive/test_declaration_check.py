@@ -92,7 +92,7 @@ WRONG: dict[str, dict[str, Any]] = {
     "function 15 cannot write a word: its table has 06H or 10H for it": {"table": Table("relay", 3, 0x0F)},
     "function 101 cannot read a word": {"table": Table("fifo", 101, 0x10)},
     "ram_address = 65536 is not an address from 0 to FFFFH": {"ram_address": 0x10000},
-    "its ram_address is its own address, which is the one that wears": {"ram_address": 5},
+    "its ram_address is its own address, at which a write wears": {"ram_address": 5},
 }
 
 
@@ -113,7 +113,7 @@ PARTS: dict[str, dict[str, Any]] = {
     },
     "FAR is bit 17, and its number has bits 0 to 15": {"what": IntFlag("Bits", {"FAR": 1 << 17})},
     "HIGH is bit 4, and its number has bits 0 to 3": {"what": IntFlag("Bits", {"HIGH": 16}), "part": (4, 7)},
-    "LOW = -1 is not within 0 to 15, which its number can be": {
+    "LOW = -1 is not within 0 to 15, the raw counts of the register": {
         "what": IntEnum("Names", {"LOW": -1}),
         "part": (4, 7),
     },
@@ -138,15 +138,15 @@ def test_mistake_in_a_read_only_register_is_reported(mistake: str) -> None:
 
 BITS = IntFlag("Bits", {"RUN": 1, "RESET": 8})
 WRITTEN: dict[str, dict[str, Any]] = {
-    "harmless = 65536 is not within 0 to 65535, which its number can be": {"harmless": (0, 65536)},
-    "harmless = -1 is not within 0 to 65535, which its number can be": {"harmless": (-1,)},
-    "broadcast = 40000 is not within -32768 to 32767, which its number can be": {
+    "harmless = 65536 is not within 0 to 65535, the raw counts": {"harmless": (0, 65536)},
+    "harmless = -1 is not within 0 to 65535, the raw counts": {"harmless": (-1,)},
+    "broadcast = 40000 is not within -32768 to 32767, the raw counts": {
         "broadcast": (40000,),
         "number_format": NumberFormat.I16,
     },
-    "broadcast = 2 is not within 0 to 1, which its number can be": {"broadcast": (2,), "table": COIL},
-    "never_together = 0088H forbids nothing: only bits with names are checked": {"never_together": (0x88,)},
-    "never_together = 0009H forbids nothing": {"what": Run, "never_together": (9,)},
+    "broadcast = 2 is not within 0 to 1, the raw counts": {"broadcast": (2,), "table": COIL},
+    "never_together = 0088H has no effect: only bits with names are checked": {"never_together": (0x88,)},
+    "never_together = 0009H has no effect": {"what": Run, "never_together": (9,)},
     "never_together = 0H is not a mask of its bits": {"what": BITS, "never_together": (0,)},
     "never_together = 10009H is not a mask of its bits": {"what": BITS, "never_together": (0x10009,)},
     "its default cannot be: level = 70000 does not fit: the register holds 0 to 65535": {"default": 70000},
@@ -305,7 +305,7 @@ def test_two_registers_with_equal_declarations_may_share_an_address() -> None:
 def test_one_register_object_with_two_names_is_reported() -> None:
     speed = reading(1, "rpm")
     assert mistakes_in(speed=speed, rpm=speed) == (
-        "rpm: this is the register speed already; declare one of its own",
+        "rpm: this object is already the register speed; declare a new one",
     )
 
     class Base(Drive):
@@ -325,7 +325,9 @@ def test_one_register_object_with_two_names_is_reported() -> None:
 
 def test_register_access_that_its_table_does_not_allow_is_reported() -> None:
     blind = Table("output", None, 0x06)
-    assert mistakes_in(v=reading(1, table=blind)) == ("v: an output cannot be read, and so holds no reading",)
+    assert mistakes_in(v=reading(1, table=blind)) == (
+        "v: an output cannot be read, so it cannot hold a reading",
+    )
     assert mistakes_in(v=reading(1, harmless=(0,)))
     assert declare(v=command(1, table=blind, harmless=(0,)))
     assert declare(v=setting(1, table=INPUT, never="it is the maker's"))

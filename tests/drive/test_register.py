@@ -438,7 +438,7 @@ def test_invalid_text_register_in_a_drive_class_is_refused() -> None:
         text(1, 2, table=COIL)
     with pytest.raises(DeclarationError, match="bus: reserved name"):
         type("Wrong", (Drive,), {"bus": text(1, 2)})
-    with pytest.raises(DeclarationError, match="second: this is the text serial already"):
+    with pytest.raises(DeclarationError, match="second: this object is already the text serial"):
         type("Wrong", (Drive,), {"second": Meter.serial})
 
 

@@ -274,7 +274,7 @@ def test_table_of_a_delixi_parameter_selects_ram_or_eeprom() -> None:
         "pi_setpoint": Kept.RAM,
         "stored_frequency": Kept.EEPROM,
     }
-    with pytest.raises(ValueError, match="its table 'parameter' is kept in EEPROM, not in RAM"):
+    with pytest.raises(ValueError, match="cannot be kept in RAM: all registers of its table 'parameter'"):
         setting(parameter(0, 17), "s", table=PARAMETER, kept=Kept.RAM)
 
 

@@ -310,7 +310,7 @@ HAZARDS = {
         yd,
         write("panel_direction", 1.0),
         naive="01 06 00 08 00 01",
-        refuses="belongs to the command over the motor",
+        refuses="decides what commands the motor",
     ),
     "the selected preset speed is verified before the motor is started": Hazard(
         lambda: YD1000(1, preset_speed=4),
@@ -527,7 +527,7 @@ def test_frozen_yd1000_status_is_not_reported_as_running_erratum_y8() -> None:
 
 
 def test_factory_value_of_the_yd1000_watchdog_is_unknown_erratum_y12() -> None:
-    assert "from the factory is not stated" in YD1000.watchdog
+    assert "the factory value is not stated" in YD1000.watchdog
     assert YD1000.communication_timeout.default is None
 
 

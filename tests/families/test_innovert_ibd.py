@@ -177,7 +177,7 @@ def test_innovert_ibd_start_and_jog_of_a_turning_motor_are_refused(turning: dict
     wire.drive.set_frequency(50)
     for verb in (wire.drive.start, wire.drive.jog):
         with pytest.raises(
-            WriteForbidden, match=r"turns, and would continue to turn during a jog: call stop\(\) first"
+            WriteForbidden, match=r"turns, and no register shows whether it jogs: call stop\(\) first"
         ):
             verb()
     assert wire.sent == [FIFTY[Framing.RTU]]

@@ -158,8 +158,8 @@ def test_yd1000_registers_that_are_never_written_are_those_of_the_document() -> 
         "it is effective from the panel only": {0x0001, 0x0007, 0x0015},
         "its scale is not stated": {0x0006, 0x0016},
         "it changes the drive's end of the line; set it on the panel": {0x0800, 0x0801, 0x0802},
-        "what it sets by itself is not stated": {0x0002},
-        "it belongs to the command over the motor; set it on the panel": {
+        "what else it sets is not stated": {0x0002},
+        "it decides what commands the motor; set it on the panel": {
             0x0003,  # CNOD
             0x0004,  # FNOD
             0x0008,  # FR
@@ -338,9 +338,9 @@ def test_yd1000_start_waits_until_1202h_shows_the_preset_speed(number: int, bits
     ("says", "sent", "sentence"),
     [
         ({}, [STOP, yd_word(0xC00C), STOP], "speed 3 was selected, its frequency command did not become 15"),
-        ({"reference_frequency": 15.0}, [STOP], "wrong bits could not be detected"),
+        ({"reference_frequency": 15.0}, [STOP], "selection of preset speed 3 could not be verified"),
         ({"preset_speed_3": 0.0}, [], "is 0: set preset_speed_3 first"),
-        ({**TURNS[FORWARD]}, [], r"turns: .*call stop\(\) first"),
+        ({**TURNS[FORWARD]}, [], r"turns, and a preset speed .*: call stop\(\) first"),
         ({"held_frequency": 30.0}, [], r"has a fault.*reset_fault\(\)"),
     ],
 )

@@ -32,8 +32,8 @@ class Mistake(NamedTuple):
 class SlotRow(NamedTuple):
     """A row of a register or channel; `slot` is its index.
 
-    With the status 0 the row has a value, with any other status it has none. A channel's row has the status
-    OLD if a register that it uses has had no row for too long.
+    Only a row with the status 0 has a value. A channel's row has the status OLD if one of its registers has
+    had no row for too long.
     """
 
     slot: int
@@ -45,10 +45,7 @@ class SlotRow(NamedTuple):
 
 
 class Outage(NamedTuple):
-    """A period that is not included in a channel's totals, because a value was unknown.
-
-    It ends at `end_ns`.
-    """
+    """A period until `end_ns` that a channel's totals do not include, because a value was unknown."""
 
     channel: str  # DRIVE.CHANNEL, such as "pump-1.energy"
     end_ns: int  # UTC
@@ -92,7 +89,7 @@ class ChannelSet:
         self._statuses = [UNSEEN] * size
         self._sent_ns = [0] * size
         self._known_ns: dict[int, int] = {}  # by index: the monotonic time of the newest known value
-        self._gaps: set[int] = set()  # indexes of channels that use a value which is too old
+        self._gaps: set[int] = set()  # indexes of channels for which a value is too old
         self._holds_ns = [round(hold_s * 1e9) for hold_s in series.holds_s]
         # by index of a channel with restored totals: the UTC time in ns of the newest value in these totals
         self._left_off: dict[int, int] = {}
@@ -132,10 +129,7 @@ class ChannelSet:
 
     @property
     def holds_s(self) -> Mapping[tuple[str, str], float]:
-        """The seconds for which a value of each channel is valid, by drive and channel name.
-
-        It is valid for as long as that of its slowest register.
-        """
+        """Seconds for which a value of each channel is valid, by drive and channel name."""
         return {(one.drive, one.channel.name): one.program.hold_s for one in self._computed}
 
     # ---- rows ----
@@ -219,10 +213,8 @@ class ChannelSet:
         fresh.add(row.slot)
 
     def _status(self, slots: Iterable[int]) -> int:
-        """Return the status of the newest row that has no value, among these registers and channels.
-
-        If each row has a value, return UNSEEN if a register or channel has had no row yet, else OK.
-        """
+        """Return the status of a row that is computed from the newest rows of these series."""
+        # the newest row without a value decides; otherwise a series that has had no row yet
         misses = [slot for slot in slots if self._statuses[slot] not in (Status.OK, UNSEEN)]
         if misses:
             return self._statuses[max(misses, key=self._sent_ns.__getitem__)]
@@ -248,10 +240,10 @@ class ChannelSet:
     # ---- totals ----
 
     def take_over(self, before: ChannelSet, replaced: Collection[str] = ()) -> None:
-        """Continue the totals of channels that `before` also has, with the same expression and units.
+        """Continue the totals of channels that `before` has too, with the same expression and units.
 
-        `before` is an earlier set. `replaced` are names that now belong to other drives. For functions with
-        a memory, an outage lies between the last value of the old drive and the first value of the new drive.
+        `before` is an earlier set. `replaced` are names that now belong to other drives. Totals do not count
+        the time between the last value of the old drive and the first value of the new one.
         """
         known = {(one.name, one.channel, *one.program.units): one for one in before._computed}
         for one in self._computed:
@@ -270,7 +262,7 @@ class ChannelSet:
                 one.program.interrupt(changed)
 
     def totals(self) -> dict[str, Any]:
-        """Return the integrals and counts of all channels that are kept over restarts, for `restore`."""
+        """Return the integrals and counts that `restore` continues after a restart."""
         return {
             one.name: {
                 "value": one.channel.value,
@@ -283,9 +275,9 @@ class ChannelSet:
         }
 
     def restore(self, kept: Mapping[str, Any]) -> list[str]:
-        """Continue with totals that were stored before a restart. Return the channels that start at 0.
+        """Continue with stored totals; return the channels that start at 0 instead.
 
-        These are the channels whose expression was changed, or whose totals are damaged in the file.
+        These are the channels whose expression was changed, or whose stored totals are damaged.
         """
         changed = []
         for one in self._computed:

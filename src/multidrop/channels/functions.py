@@ -32,10 +32,7 @@ class Typed(NamedTuple):
 
 
 def _alike(units: Units, what: str) -> Typed:
-    """Return a result in the unit of the first operand that has a unit; the others are converted to it.
-
-    Raises ValueError if one cannot be converted.
-    """
+    """Convert all operands to the first unit. Raises ValueError if one cannot be converted."""
     first = next((unit for unit in units if unit is not None), None)
     for unit in units:
         if first is not None and unit is not None and not unit.is_like(first):
@@ -201,8 +198,8 @@ class Curve:
 class StatefulFunction:
     """A function with a memory. Call `take` once for each known value, in the order of time.
 
-    `kept` has the numbers to store in a state file. If two values are further apart than `hold_ns`, or if
-    `is_interrupted` was set, an outage lies between them.
+    `kept` has the numbers to store in a file. Values that are further apart than `hold_ns` have an outage
+    between them, and so have the values before and after `is_interrupted` was set.
     """
 
     is_total = True  # True if the memory is kept over restarts
@@ -282,7 +279,7 @@ class EdgeCount(StatefulFunction):
     def __init__(self) -> None:
         super().__init__()
         self.result = 0.0
-        # the previous value; None before the first value, which is not counted
+        # the previous value; None before the first one, which is not counted
         self._was: float | None = None
 
     def _first(self, value: float) -> None:

@@ -1,7 +1,7 @@
 """Parse expressions of computed channels, such as "integral(pump-1.output_power)".
 
-The result is a list of steps for a stack machine: operands come before their operator. For any text,
-parsing and evaluation recurse at most MOST_DEPTH levels deep. No text reaches Python's own parser.
+The result is a list of steps for a stack machine: operands come before their operator. Parsing and evaluation
+recurse at most MOST_DEPTH levels deep, for any text. No text reaches Python's own parser.
 """
 
 from __future__ import annotations

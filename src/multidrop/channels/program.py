@@ -32,9 +32,8 @@ COMPUTED = AddressTable("computed channel", None, None)
 class Channel:
     """A value computed from polled registers, such as `Channel("energy", "integral(output_power)", "kWh")`.
 
-    Rows of the channel have the name of its drive, and `name` in place of a register. `value` is an
-    expression; its results are converted to `unit`. If `is_kept`, the channel's totals continue after a
-    restart.
+    Its rows have the name of its drive, and `name` in place of a register. `value` is an expression whose
+    results are converted to `unit`. With `is_kept`, its totals continue after a restart.
     """
 
     name: str
@@ -44,7 +43,7 @@ class Channel:
 
     @cached_property
     def register(self) -> Register[float]:
-        """The channel as a register, which gives its name and unit. It has no address and is never read."""
+        """A register with the channel's name and unit, which is never read."""
         register = Register[float](
             0,
             Access.READING,
@@ -58,10 +57,7 @@ class Channel:
 
 
 class DriveSeries(NamedTuple):
-    """A drive's polled registers and its channels.
-
-    Each register has its unit, and the time in s for which its value is valid.
-    """
+    """A drive's channels, and its polled registers with unit and the time in s for which a value is valid."""
 
     name: str
     polled: Mapping[str, tuple[str, float]]
@@ -70,7 +66,7 @@ class DriveSeries(NamedTuple):
 
 
 class _Operand(NamedTuple):
-    """An operand of an expression that is being checked: its unit, and the registers and channels in it."""
+    """An operand of an expression: its unit, and the registers and channels in it."""
 
     column: int
     unit: ValueUnit | None
@@ -111,10 +107,7 @@ _Instruction = float | _Load | _Applied | _Memorised
 
 
 class SeriesTable:
-    """The registers and channels of a plant, by drive and name.
-
-    Each has an index, a unit, and a time in s for which its values are valid.
-    """
+    """The registers and channels of a plant: their index, unit, and the time for which a value is valid."""
 
     def __init__(self, drives: Iterable[DriveSeries]) -> None:
         self.drives = {drive.name: drive for drive in drives}
@@ -240,10 +233,7 @@ class Program:
         return typed.unit
 
     def _table(self, operands: list[_Operand]) -> ValueUnit:
-        """Replace the instructions for the points of a table by one instruction.
-
-        Return the unit of its result.
-        """
+        """Replace the instructions for the points of a table by one; return the unit of its result."""
         if len(operands) < 2 or operands[0].text is not None or operands[1].text is None:
             raise ValueError('table takes a position, a unit and points: table(x, "m3/h", x1, y1, x2, y2)')
         points = operands[2:]

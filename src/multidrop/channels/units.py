@@ -1,6 +1,6 @@
 """Units in expressions: their dimensions, and the factors that convert between units of one dimension.
 
-A unit that is not listed here, such as "pulses", has its own dimension. A revolution has one too: 1 rpm is
+A unit that is not listed here, such as "pulses", has a dimension of its own. So has a revolution: 1 rpm is
 not 1/60 Hz, and torque times speed in rpm is a power only with the factor 2 pi.
 """
 

@@ -27,8 +27,7 @@ EXCEPTION_CODES = range(1, 256)
 _SAME_SPACE = {0x05: 0x0F, 0x06: 0x10}
 _TAKEN = "reserved name; every drive has it for something else"
 
-# An attribute's name, a function that checks its value, and the end of the error sentence, which begins with
-# "NAME = VALUE".
+# For each attribute: its name, a function that checks the value, and the error's text after "NAME = VALUE"
 Rules = tuple[tuple[str, Callable[[Any], Any], str], ...]
 
 
@@ -192,7 +191,7 @@ def text_errors(texts: Mapping[str, Text], taken: Collection[str]) -> list[str]:
     """Return an error sentence for each wrong text register of a class; `taken` are the reserved names."""
     found = [f"{name}: {_TAKEN}; rename the text" for name in texts if name in taken]
     return found + [
-        f"{name}: this is the text {text.name} already; declare one of its own"
+        f"{name}: this object is already the text {text.name}; declare a new one"
         for name, text in texts.items()
         if text.name != name
     ]
@@ -293,9 +292,9 @@ def _table_errors(register: Register[Any]) -> Iterator[str]:
             yield f"function {code!r} cannot {verb} a {table.carrier.value}: its table has {codes} for it"
     name = f"an {table.name}" if table.name[0] in "aeiou" else f"a {table.name}"
     if access is not Access.COMMAND and table.read is None:
-        yield f"{name} cannot be read, and so holds no {access.value}"
+        yield f"{name} cannot be read, so it cannot hold a {access.value}"
     if access is not Access.READING and table.write is None and not register.never:
-        yield f"{name} cannot be written, and so holds no {access.value}"
+        yield f"{name} cannot be written, so it cannot hold a {access.value}"
     if access is Access.READING and (register.harmless or register.broadcast or register.moves):
         yield "a reading is never written: leave out harmless, broadcast and moves"
 
@@ -319,16 +318,13 @@ _OF_WORDS = {"part": None, "invalid": (), "order": "ABCD", "scale_register": ""}
 
 
 def _number_errors(register: Register[Any]) -> Iterator[str]:
-    """Yield an error sentence for each attribute that does not fit the register's number format.
-
-    The number format must already be known to fit the register's table.
-    """
+    """Yield an error sentence for each attribute that does not fit the register's number format."""
     number_format, is_reading = register.number_format, register.access is Access.READING
     for name, at in (("address", register.address), ("ram_address", register.ram_address)):
         if at is not None and at + register.words - 1 > LAST_ADDRESS:
             yield f"{name} {at:04X}H: its {register.words} words reach beyond FFFFH"
     if register.ram_address == register.address:
-        yield "its ram_address is its own address, which is the one that wears the EEPROM"
+        yield "its ram_address is its own address, at which a write wears the EEPROM"
     if register.table.carrier is not Carrier.WORD:
         for name, common in _OF_WORDS.items():
             if getattr(register, name) != common:
@@ -336,7 +332,7 @@ def _number_errors(register: Register[Any]) -> Iterator[str]:
         return
     if register.is_float and register.values is not None:
         names = register.values.__name__
-        yield f"number_format = {number_format.name} is for numbers, and {names} names whole ones"
+        yield f"number_format = {number_format.name} is for decimal numbers, but {names} names whole numbers"
     if register.order == "BA" and register.words > 1:
         yield f"order = 'BA' is for one word, and this has {register.words}: CDAB, BADC or DCBA"
     if number_format is NumberFormat.I8 and not is_reading:
@@ -362,8 +358,8 @@ def _is_flags(register: Register[Any]) -> bool:
 
 
 def _counts(register: Register[Any]) -> tuple[Fraction, Fraction]:
-    """Return the smallest and the largest raw count of the register. Flags are never negative."""
-    # flags are unsigned, even in a signed format, because the highest bit may be a named flag
+    """Return the smallest and the largest raw count of the register."""
+    # flags are never negative, even in a signed format: the highest bit may be a named flag
     if _is_flags(register):
         return Fraction(0), Fraction((1 << register.coding.mask.bit_count()) - 1)
     return register.coding.raw_span
@@ -375,10 +371,10 @@ def _written_errors(register: Register[Any]) -> Iterator[str]:
     for key in ("harmless", "broadcast"):
         for count in getattr(register, key) or ():
             if not least <= count <= most:
-                yield f"{key} = {count} is not within {least} to {most}, which its number can be"
+                yield f"{key} = {count} is not within {least} to {most}, the raw counts of the register"
     for mask in register.never_together:
         if not _is_flags(register):
-            yield f"never_together = {mask:04X}H forbids nothing: only bits with names are checked; name them"
+            yield f"never_together = {mask:04X}H has no effect: only bits with names are checked; name them"
         elif not 0 < mask <= most:
             yield f"never_together = {mask:X}H is not a mask of its bits"
     if register.values is not None:
@@ -424,7 +420,8 @@ def _name_errors(register: Register[Any]) -> Iterator[str]:
             last = register.coding.mask.bit_count() - 1
             yield f"{member.name} is bit {member.value.bit_length() - 1}, and its number has bits 0 to {last}"
         else:
-            yield f"{member.name} = {member.value} is not within {least} to {most}, which its number can be"
+            span = f"{least} to {most}, the raw counts of the register"
+            yield f"{member.name} = {member.value} is not within {span}"
 
 
 # ---- registers together ----
@@ -442,7 +439,7 @@ def declaration_errors(
         if name in taken:
             found.append(f"{name}: {_TAKEN}; rename the register")
         if register.name != name:
-            found.append(f"{name}: this is the register {register.name} already; declare one of its own")
+            found.append(f"{name}: this object is already the register {register.name}; declare a new one")
         wrong = [*_wrong_facts(register, _REGISTER_RULES).values()] or list(
             _errors_together(register, registers, bounds)
         )
@@ -455,9 +452,7 @@ def declaration_errors(
 def _sharing_errors(registers: list[Register[Any]]) -> Iterator[str]:
     """Yield an error sentence for each pair of registers that write different things to the same address.
 
-    A reading may share its address with any register, and different tables may use the same addresses. A
-    register that commands the motor must not share its address with the RAM address of a setting, or with a
-    register that allows other values in plain writes. Otherwise a plain write could start the motor.
+    Otherwise a plain write of a setting could start the motor. A reading may share its address.
     """
     written = [one for one in registers if one.access is not Access.READING and one.table.write is not None]
     at: dict[tuple[object, int], list[Register[Any]]] = {}
@@ -481,7 +476,7 @@ def _sharing_errors(registers: list[Register[Any]]) -> Iterator[str]:
 
 
 def written_places(register: Register[Any]) -> list[tuple[object, int]]:
-    """Return the table and address of each coil or word that a write to this register changes."""
+    """Return the table and the address of each coil or word that a write to this register may change."""
     if register.access is Access.READING:
         return []
     starts = [register.address, *([] if register.ram_address is None else [register.ram_address])]

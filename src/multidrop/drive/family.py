@@ -86,9 +86,7 @@ class Drive(RegisterAccess):
     turnaround_delay: ClassVar[float] = 0.1  # s without requests after a broadcast
     # least time in s from the end of a reply to the next request to the same drive
     least_interval: ClassVar[float] = 0.0
-    # True if the drive answers every read in its tables with a value or an exception. Then a late reply could
-    # be mistaken for the reply to the next read. So the first reply counts only after a read of a register
-    # whose value is known.
+    # True if the drive answers every read of its tables, with a value or an exception
     answers_every_read: ClassVar[bool] = False
 
     # ---- registers, exceptions and commands ----
@@ -159,7 +157,7 @@ class Drive(RegisterAccess):
 
     @classmethod
     def _all_options(cls) -> Mapping[str, Option]:
-        """Return the class's options, and `confirmed` if commands need it: see `check_confirmed`."""
+        """Return the options of the class, with `confirmed` if its commands need it (`check_confirmed`)."""
         commands = any(
             register.commands or register.access is Access.COMMAND for register in cls.registers.values()
         )
@@ -174,7 +172,7 @@ class Drive(RegisterAccess):
 
     @classmethod
     def _kind(cls) -> str:
-        """Return the family's title; without one, its class name."""
+        """Return the title of the family, else the name of its class."""
         return cls.title or cls.__name__
 
     @classmethod
@@ -334,19 +332,18 @@ class Drive(RegisterAccess):
 
     @property
     def identity_is_weak(self) -> bool:
-        """True if `identify` may accept a drive of another make. Then `families.makes` is checked too."""
+        """True if `identify` may accept a drive of another make, so that `families.makes` is needed too."""
         return False
 
     @property
     def echo_probe(self) -> Register[Any] | None:
-        """Register whose reply never equals its request, to detect an echo; None if the family has none."""
+        """A register whose reply never equals the request, to detect an echo; None if there is none."""
         return None
 
     def known_counts(self) -> Mapping[Register[Any], tuple[int, int]]:
-        """Return registers whose raw count lies in a known range, with the smallest and the largest count.
+        """Return registers with known raw counts, each with its smallest and its largest count.
 
-        The ranges must not overlap. If a family reads one register at a time, only the value in a reply shows
-        which register the reply belongs to.
+        The ranges must not overlap, because the value in a reply must show which register was read.
         """
         return {}
 
@@ -375,7 +372,7 @@ class Drive(RegisterAccess):
 
     @property
     def commanded(self) -> float | None:
-        """The setpoint written last, if the drive is known to hold it, else None."""
+        """The setpoint that was written last; None unless the drive is known to hold it."""
         return self._known_setpoint.value
 
     @commanded.setter
@@ -393,7 +390,10 @@ class Drive(RegisterAccess):
         return self.link.perform(self, script)
 
     def begin_call(self, verb: str, seen: int) -> Any:
-        """Register a call of a verb, so that a later stop can cancel it; `seen` stops were called before."""
+        """Register a call of a verb, so that a later stop can cancel it.
+
+        `seen` is the number of stops that were called before this call.
+        """
         return self.link.begin_call(self, verb, seen)
 
     def carry_out_move(self, script: Script[Any], call: Any) -> Any:
@@ -426,18 +426,18 @@ class Drive(RegisterAccess):
         register = self.register(self.setpoint_name)
         held = (yield from read(register)) if register.readable else self.commanded
         if held is None:
-            why = f"{self.name} cannot report its setpoint:"
+            problem = f"{self.name} cannot report its setpoint:"
         elif held == 0:
-            why = f"the setpoint of {self.name} is 0:"
+            problem = f"the setpoint of {self.name} is 0:"
         elif self.commanded is not None and held != self.commanded:
             shown = f"{register.format(held)} and not {register.format(self.commanded)}"
-            why = f"{self.name} holds {shown} as written: it may have lost its power;"
+            problem = f"{self.name} holds {shown} as written: it may have lost its power;"
         else:
             return
-        raise WriteForbidden(f"{why} call set_frequency before start", advice=_SETPOINT_FIRST)
+        raise WriteForbidden(f"{problem} call set_frequency before start", advice=_SETPOINT_FIRST)
 
-    def _stop_first(self, why: str) -> WriteForbidden:
-        return WriteForbidden(f"{why} call stop() first", advice=Advice.call("stop"))
+    def _stop_first(self, problem: str) -> WriteForbidden:
+        return WriteForbidden(f"{problem}: call stop() first", advice=Advice.call("stop"))
 
     def _reset_first(self, fault: str = "") -> WriteForbidden:
         shown = f"a fault, {fault}" if fault else "a fault"

@@ -14,7 +14,7 @@ from multidrop.errors import BusError
 
 MOST_STEPS = 20
 FAULT = "fault"  # name of the register with the fault code, in every family that has one
-# registers with the newest fault, whether or not it is still active
+# registers with the newest fault, which may be over
 FAULT_RECORDS = ("last_fault", "fault_record_1")
 
 
@@ -26,9 +26,8 @@ class StateReader:
 
     def __init__(self, drive: Drive) -> None:
         self._drive = copy(drive)
-        self._shown: tuple[dict[str, float | None], State | None] | None = (
-            None  # the values that the last call used, and the state that it returned
-        )
+        # the values that the last call used, and the state that it returned
+        self._shown: tuple[dict[str, float | None], State | None] | None = None
         self.has_state = type(drive).state is not Drive.state
         """True if the family's document defines a state."""
         self.lacks = ""
@@ -75,7 +74,7 @@ class StateReader:
 
 
 def _known(state: object, read: Mapping[str, float | None]) -> State | None:
-    """Return the state. Without the fault code, return FAULT without a name, or None for other states."""
+    """Return the state; without a fault code, only the condition FAULT is known."""
     if not isinstance(state, State) or read.get(FAULT, 0) is not None:
         return state if isinstance(state, State) else None
     return State(Condition.FAULT) if state.condition is Condition.FAULT else None

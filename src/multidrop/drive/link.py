@@ -14,7 +14,7 @@ T = TypeVar("T", bound=float)
 
 
 class TextWanted(Exception):
-    """Raised if a text register is among the registers to read, because it needs a request of its own."""
+    """Raised if a text is among the registers to read, because a text needs a request of its own."""
 
 
 class Link(Protocol):

@@ -66,7 +66,7 @@ class Table:
 
     @property
     def read_space(self) -> tuple[Carrier, int | None]:
-        """Key that is equal for tables with the same read function: one request can read both."""
+        """A key that is equal for tables that one request can read together."""
         return self.carrier, self.read
 
 
@@ -133,7 +133,7 @@ class Register(Generic[T]):
     note: str = ""
     titles: Mapping[str, str] = field(default_factory=dict)
     name: str = field(default="", init=False)
-    # the register that holds this register's power of ten
+    # the register that holds the power of ten for this value
     scaled_by: Register[float] | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
@@ -145,8 +145,10 @@ class Register(Generic[T]):
         table_kept = getattr(self.table, "kept", Kept.UNKNOWN)
         if self.access is not Access.READING and table_kept is not Kept.UNKNOWN:
             if self.kept not in (Kept.UNKNOWN, table_kept):
-                table = f"its table {self.table.name!r} is kept in {table_kept.value}"
-                raise ValueError(f"register {self.address:04X}H: {table}, not in {self.kept.value}")
+                raise ValueError(
+                    f"register {self.address:04X}H cannot be kept in {self.kept.value}: all registers of its "
+                    f"table {self.table.name!r} are kept in {table_kept.value}"
+                )
             object.__setattr__(self, "kept", table_kept)
 
     def __set_name__(self, owner: type, name: str) -> None:
@@ -162,10 +164,7 @@ class Register(Generic[T]):
         return self.name.replace("_", " ")
 
     def title_in(self, language: str) -> str:
-        """Return the title in a language such as "ru".
-
-        This is the declared title, else the title in the catalogue, else the English title.
-        """
+        """Return the title in a language such as "ru"; the English title if there is none."""
         return self.titles.get(language) or catalogue(language).get(self.name) or self.title
 
     @cached_property
@@ -175,7 +174,7 @@ class Register(Generic[T]):
 
     @cached_property
     def reach(self) -> range:
-        """Addresses that one request must read for the value, including that of the scale register."""
+        """Addresses that one request must read to get the value; they include the scale register."""
         own = range(self.address, self.address + self.words)
         if self.scaled_by is None:
             return own
@@ -214,7 +213,7 @@ class Register(Generic[T]):
 
     @property
     def commands(self) -> bool:
-        """True if a write may move the motor, so that only verbs send it (except `harmless` counts)."""
+        """True if a write to the register may move the motor. Only verbs write such a register."""
         if self.moves is None:
             return self.access is Access.COMMAND or self.harmless is not None
         return self.moves
@@ -324,7 +323,7 @@ class Register(Generic[T]):
 
     @property
     def _counts(self) -> bool:
-        """True if the values are choices or raw counts, not quantities: these are not rounded."""
+        """True if the values are choices or raw counts, which are never rounded."""
         return self.step is None or (self.step == 1 and not self.unit)
 
     def _encode_name(self, value: T) -> int:
@@ -419,7 +418,7 @@ def _number_in(text: str) -> float:
 
 
 def _short(value: float) -> str:
-    """Return a number as short text for an error message. It may be larger than any float."""
+    """Return a number, which may be larger than any float, as short text for an error message."""
     return f"{value:g}" if abs(value) <= sys.float_info.max else "a number of this size"
 
 
@@ -431,11 +430,10 @@ class Details(TypedDict, total=False):
 
     step: float | None  #: quantity that one raw count stands for; None if the document does not state it
     offset: float  #: value of the raw count 0, so that value = raw count * step + offset
-    #: Raw counts that mean "no value". A count outside the format's span is a bit pattern, such as 0x8000 for
-    #: an I16.
+    #: Raw counts that mean "no value", or bit patterns, such as 0x8000 for an I16
     invalid: float | tuple[float, ...]
-    #: Lowest and highest bit, for a reading that is only a range of bits of a number. An `invalid` count that
-    #: does not fit into these bits is compared with the whole number.
+    #: Lowest and highest bit of a reading that is only a part of a number. An `invalid` count that does not
+    #: fit into these bits is compared with the whole number.
     part: tuple[int, int]
     #: order of the number's bytes on the wire, A the most significant: ABCD, CDAB, BADC, DCBA, AB or BA
     order: str
@@ -454,8 +452,8 @@ class Details(TypedDict, total=False):
     #: True if a write may start, stop or reset something, so that only verbs write it. The default is True
     #: for commands, and for settings that have `harmless`.
     moves: bool
-    #: For a register that moves the motor: the raw counts that any caller may write at any time, and that are
-    #: sent again if the reply is lost. All other raw counts are sent only by verbs, and only once.
+    #: Raw counts that do not move the motor although the register can: any caller may write them at any time,
+    #: and they are repeated if the reply is lost. Only verbs send other raw counts, and only once.
     harmless: tuple[int, ...]
     never: str  #: reason why the library never writes the register
     never_together: tuple[int, ...]  #: masks of bits that are never set in one write

@@ -38,9 +38,9 @@ def read_limit(family: Any, table: Table) -> int:
 
 
 def function_limit(family: Any, function: int) -> int:
-    """Return how many addresses one read with this Modbus function code may have, declared or not.
+    """Return the limit of addresses in one read with this Modbus function code.
 
-    This is the smallest limit that the family states, but at least the length of its longest register.
+    The longest register of the family can always be read whole.
     """
     standard = STANDARD_LIMITS[FUNCTIONS[function]]
     stated: list[int] = [most for table, most in family.most_registers.items() if table.read == function]
@@ -67,7 +67,7 @@ def readable_addresses(family: Any, table: Table) -> frozenset[int]:
 
 
 def may_be_crossed(family: Any, table: Table, addresses: Iterable[int]) -> bool:
-    """Return True if one read may include all these addresses, wanted or not."""
+    """Return True if one read may include all these addresses, even if some of them are not needed."""
     declared = family if isinstance(family, type) else type(family)
     readable, gaps = readable_addresses(declared, table), stated_gaps(family, table)
     return all(at in readable or any(at in gap for gap in gaps) for at in addresses)
@@ -119,7 +119,7 @@ def write_request(drive: Any, register: Register[Any], raw: float, address: int 
 
 
 def check_no_read(drive: Any, request: Message) -> None:
-    """Raise ValueError for a Modbus read, because a raw request could return an earlier read's late reply."""
+    """Raise ValueError for a Modbus read, which `send_raw` could confuse with an earlier read."""
     if drive.framing is not Framing.DELIXI and request.function in READS:
         asked = f"{request.function}, {request.start}, {request.count}"
         raise ValueError(

@@ -33,7 +33,7 @@ from multidrop.printable import is_number
 if TYPE_CHECKING:
     from multidrop.drive.family import Drive
 
-MOST_UNANSWERED = 3  # limit of checks in a row without a valid reply; then `until` raises the error
+MOST_UNANSWERED = 3  # after this many checks in a row without a valid reply, `until` raises the error
 
 T = TypeVar("T", bound=float)
 R = TypeVar("R")
@@ -198,7 +198,7 @@ _TAKES: Mapping[str, tuple[str, tuple[type, ...], str]] = {
     "set_frequency": ("hz", (Real,), "a number in Hz"),
 }
 
-TRIES = 150  # limit of attempts to send a stop while the system lacks memory or file descriptors
+TRIES = 150  # limit of attempts to begin a stop while the system lacks memory or file descriptors
 
 
 class CalledStop(Protocol):

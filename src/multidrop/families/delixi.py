@@ -27,7 +27,7 @@ from multidrop.drive.verbs import Script, insist, read, verb, write
 # s; default time limit of a stop, because the parameter number of the deceleration time is not known
 STOP_TIME = 60.0
 
-KEYPAD = "it belongs to the line or to the command over the motor; set it on the keypad"
+KEYPAD = "it sets up the line, or decides what commands the motor; set it on the keypad"
 
 UNIT_INFERRED = "Its unit is inferred: the manual has only the name."
 
@@ -301,7 +301,7 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
     def start(self, direction: Direction | None = None) -> Script[None]:
         """Start at the setpoint in force. Without a direction: forward, and only from rest."""
         if self._jogged and not (yield from self._is_at_rest()):
-            raise self._stop_first(f"{self.name} may still jog, and a start may not end the jog:")
+            raise self._stop_first(f"{self.name} may still jog, and a start may not end the jog")
         forward = yield from self._goes_forward(direction)
         if (yield from read(self.frequency_source)) != 1:
             raise WriteForbidden(f"{self.name} takes no setpoint from P00.02: set P00.01 to 1 on the keypad")
@@ -317,7 +317,7 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
         """Turn slowly from rest until stopped; without a direction, forward."""
         forward = yield from self._goes_forward(direction)
         if not (yield from self._is_at_rest()):
-            raise self._stop_first(f"{self.name} turns, and may continue to turn during a jog:")
+            raise self._stop_first(f"{self.name} turns, and may continue to turn during a jog")
         self._jogged = True
         yield from write(
             self.control, DelixiModbusControl.JOG_FORWARD if forward else DelixiModbusControl.JOG_REVERSE

@@ -143,10 +143,10 @@ class ErmanERG220(Drive):
     most_devices = 31  # section 1
     remote = "b.001 must be 2 and b.002 5 (RS-485)"
     line_parameters = (
-        "b.010 address (1 from the factory), set while the motor stands, in effect when the mains come back; "
+        "b.010 address (1 from the factory), set while the motor stands, in effect after the next power-on; "
         "38400 bit/s and 1 stop bit are fixed, and there is no parity"
     )
-    no_broadcasts = "the manual calls address 0 one, and does not say that nobody answers: none is sent"
+    no_broadcasts = "the manual does not say whether drives reply to address 0, so none is sent"
     addresses = range(1, 32)
     answers_every_read = True
     most_registers = {HOLDING: 88, INPUT: 17, COIL: 12}

@@ -181,7 +181,7 @@ class InnovertIBD(Drive):
     run_source = setting(
         parameter("Prb.02"),
         IBDRunSource,
-        never="it gives the command over the motor away; set it on the keypad",
+        never="it decides what commands the motor; set it on the keypad",
         place="Prb.02",
     )
     acceleration_time = setting(parameter("Prb.07"), "s", step=0.1, place="Prb.07")
@@ -297,7 +297,7 @@ class InnovertIBD(Drive):
         if word is IBDControl.RUN:
             yield from self._setpoint_in_force()
         if (yield from self._runs()):
-            raise self._stop_first(f"{self.name} turns, and would continue to turn during a jog:")
+            raise self._stop_first(f"{self.name} turns, and no register shows whether it jogs")
         yield from write(self.control, sent)
         yield from self._started(direction)
 

@@ -109,11 +109,11 @@ class CommunicationFault(IntEnum):
 
 @declaration
 def parameter(ordinal: int, what: Any = "", /, **details: Unpack[Details]) -> Register[Any]:
-    """Declare a parameter by its position in the list of your model's manual (section 11.6.4).
+    """Declare a parameter by its ordinal, its position in the list of your model's manual (section 11.6.4).
 
-    The parameter is in EEPROM, but writes go to its RAM alias, the address with bit 15 set, whose value is
-    lost at power-off. Use `stored_parameter` for permanent writes. Before the first write, compare the value
-    read with the keypad: with a wrong ordinal a write may restore the factory settings.
+    The parameter is kept in EEPROM, but writes go to its address in RAM, which has bit 15 set. A written
+    value is lost at power-off; use `stored_parameter` for permanent writes. Before the first write, compare
+    the value read with the keypad: with a wrong ordinal a write may restore the factory settings.
 
         class MyCHE(InvtCHE):
             acceleration_time = parameter(8, "s", step=0.1, place="P0.08")
@@ -126,7 +126,7 @@ def parameter(ordinal: int, what: Any = "", /, **details: Unpack[Details]) -> Re
 
 @declaration
 def stored_parameter(ordinal: int, what: Any = "", /, **details: Unpack[Details]) -> Register[Any]:
-    """Declare a parameter whose writes go to EEPROM, and so survive a loss of power.
+    """Declare a parameter whose writes go to EEPROM, so that they survive a loss of power.
 
     Every write wears the EEPROM (section 11.6.4), so writes are sent only on change, and are counted.
     """
@@ -136,7 +136,7 @@ def stored_parameter(ordinal: int, what: Any = "", /, **details: Unpack[Details]
 
 def _in_section_11_6_4(ordinal: int, details: Details) -> None:
     if not 0 <= ordinal <= 0x01FF:
-        raise ValueError(f"ordinal {ordinal} is outside 0 to 511: the address's high byte is 00 or 01")
+        raise ValueError(f"ordinal {ordinal} is outside 0 to 511, the addresses of parameters")
     details["kept"] = Kept.EEPROM
     details.setdefault("place", f"section 11.6.4, ordinal {ordinal}")
 
@@ -300,7 +300,7 @@ class InvtCHE(Drive):
         Without a direction, a turning motor keeps its direction, and a resting motor turns forward.
         """
         if self._jogged and not (yield from self._is_at_rest()):
-            raise self._stop_first(f"{self.name} may still jog, and a start may not end the jog:")
+            raise self._stop_first(f"{self.name} may still jog, and a start may not end the jog")
         forward = yield from self._goes_forward(direction)
         yield from self._setpoint_in_force()
         self._jogged = False
@@ -312,7 +312,7 @@ class InvtCHE(Drive):
         """Turn slowly from rest until stopped; without a direction, forward."""
         forward = yield from self._goes_forward(direction)
         if not (yield from self._is_at_rest()):
-            raise self._stop_first(f"{self.name} turns, and may continue to turn during a jog:")
+            raise self._stop_first(f"{self.name} turns, and may continue to turn during a jog")
         self._jogged = True
         yield from write(self.control, CHEControl.JOG_FORWARD if forward else CHEControl.JOG_REVERSE)
         yield from self._started(direction)

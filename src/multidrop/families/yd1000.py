@@ -22,7 +22,7 @@ RESET_TIME = 3.0  # s; the drive may not reply for this long while it restarts
 
 PANEL = "it is effective from the panel only"
 LINE = "it changes the drive's end of the line; set it on the panel"
-COMMAND = "it belongs to the command over the motor; set it on the panel"
+COMMAND = "it decides what commands the motor; set it on the panel"
 NO_SCALE = "its scale is not stated"
 RUN_FUNCTIONS = (2, 3)  # input functions that run the motor; the factory settings of the terminals F and R
 AT_ONCE = "Takes effect at once."
@@ -211,7 +211,7 @@ class YD1000(Drive):
     broadcasts = True
     identify_recognises = True
     remote = (
-        "nothing is to be set for it: bits 15 and 14 of a start go before CNOD and FNOD; after a trip or an "
+        "no setting is needed, because bits 15 and 14 of a start override CNOD and FNOD; after a trip or an "
         "emergency stop the drive needs reset_fault()"
     )
     line_parameters = (
@@ -236,8 +236,8 @@ class YD1000(Drive):
         ),
     }
     watchdog = (
-        "F803: trips with Err.5 when no valid message comes for 1 to 100 s, counted from the first one; 0 is "
-        "off, and what it is from the factory is not stated. Set it, as communication_timeout, longer than "
+        "F803: the drive trips with Err.5 if it gets no valid message for 1 to 100 s, counted from the first "
+        "one. 0 is off, and the factory value is not stated. Set it, as communication_timeout, longer than "
         "the longest gap between two polls."
     )
 
@@ -245,7 +245,7 @@ class YD1000(Drive):
     automatic_ramp = choice(0x0000, "6.1, AU1", 1, default=0)
     automatic_torque_boost = choice(0x0001, "6.1, AU2", default=0, while_running=False, never=PANEL)
     automatic_environment = choice(
-        0x0002, "6.1, AU3", 2, default=0, while_running=False, never="what it sets by itself is not stated"
+        0x0002, "6.1, AU3", 2, default=0, while_running=False, never="what else it sets is not stated"
     )
     command_mode = choice(0x0003, "6.1, CNOD", 1, default=1, never=COMMAND)
     frequency_mode = choice(0x0004, "6.1, FNOD", 2, default=2, never=COMMAND)
@@ -422,12 +422,12 @@ class YD1000(Drive):
                 f"preset speed {number} of {self.name} is 0: set preset_speed_{number} first"
             )
         if (yield from self._without_fault()).condition is Condition.RUNNING:
-            raise self._stop_first(f"{self.name} turns: a preset speed is started from rest, so")
+            raise self._stop_first(f"{self.name} turns, and a preset speed is started only from rest")
         yield from insist(self.control, STOP)
         if (yield from read(self.reference_frequency)) == hz:
             raise WriteForbidden(
-                f"{self.name} already has {hz:g} Hz as its frequency command, like preset speed {number}: "
-                "wrong bits could not be detected; write another frequency to 1001H first"
+                f"{self.name} is not started: its frequency command is already {hz:g} Hz, so the selection "
+                f"of preset speed {number} could not be verified; write another frequency to 1001H first"
             )
         bits = YD1000Control(0)
         for at, bit in enumerate(PRESET_SPEEDS):
@@ -549,7 +549,7 @@ class YD1000(Drive):
         If the motor is then seen to turn, or the drive does not answer, the stop is written again.
         """
         if not (yield from self._is_at_rest()):
-            raise self._stop_first(f"{self.name} turns:")
+            raise self._stop_first(f"{self.name} turns")
         yield from self._no_terminal_runs("once the line no longer commands it")
         try:
             yield from write(self.control, YD1000Control(0))

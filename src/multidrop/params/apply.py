@@ -23,17 +23,17 @@ from multidrop.params.values import ParameterSet
 from multidrop.transport import clock
 
 NotWritten = BusError | OSError | Outcome  # why a parameter was not written; str() gives a sentence
-# Called after each write with its number, the total, the change, and why it was not written (None: it was).
+# Called after each write: its number, the number of writes, the change, and why it failed (None: it did not).
 Report = Callable[[int, int, ParameterChange, NotWritten | None], None]
 
 
 @dataclass
 class Applied:
-    """The result of applying parameters: the writes made, and the parameters refused.
+    """The result of applying parameters: the writes that were made, and the parameters that were refused.
 
     `earlier` has a sentence for each write of a previous, interrupted call. `failure` is the error that
-    ended this call early (None without one); call `apply` again to continue. An OSError comes from the
-    journal or the EEPROM ledger, for example on a full disk.
+    ended this call early, or None; call `apply` again to continue. An OSError comes from the journal or the
+    EEPROM ledger, for example on a full disk.
     """
 
     plan: ApplyPlan
@@ -143,9 +143,9 @@ def _note_outcome(change: ParameterChange, outcome: str, result: Applied, journa
 
 
 class _Journal:
-    """A file beside the EEPROM ledger that lists the writes of a call of `apply` until the call ends.
+    """A file that lists the writes of a call of `apply`, and that is removed at the end of the call.
 
-    If the file exists at the start, it lists the writes of an interrupted call.
+    So a file that exists at the start lists the writes of an interrupted call.
     """
 
     def __init__(self, drive: Drive) -> None:

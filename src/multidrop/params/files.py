@@ -40,7 +40,7 @@ def is_parameter_file(path: Path | str) -> bool:
 def load(path: Path | str) -> ParameterSet:
     """Return the parameters in a TOML or CSV file. Raises ValueError if the file is invalid."""
     path = Path(path)
-    # Reading a serial port here would block, and would consume bytes from its drives.
+    # a serial port is not opened, because reading it would take bytes from its drives
     if path.exists() and not path.is_file():
         raise ValueError(f"{path}: this is not a file, but a directory or a device; name a parameter file")
     try:
@@ -198,7 +198,7 @@ def _known(family: Any) -> Mapping[str, Parameter]:
 
 
 def _words(parameter: Parameter | None, raw: int) -> tuple[str, str, str]:
-    """Return a declared parameter's name, value and factory value as texts; three empty texts for None."""
+    """Return the name, value and factory value of a parameter as texts, empty if it is not declared."""
     if parameter is None or not parameter.is_declared:
         return "", "", ""
     default = parameter.default_raw

@@ -15,7 +15,7 @@ from multidrop.planning.blocks import Block, blocks, halves
 from multidrop.transport import clock
 
 ILLEGAL_FUNCTION = 1  # exception code: the drive does not support the function of this read
-GROUP_END = 10  # after this many unanswered reads in a row, the end of a group is assumed
+GROUP_END = 10  # after this many unanswered reads in a row, a parameter group is assumed to end
 READ_EXPIRY = 60.0  # time limit, in s, for a read to wait until a polled line is free
 ATTEMPTS = 3
 

@@ -59,9 +59,9 @@ def load_plant(path: Path | str) -> Plant:
 
 
 def load_served_plant(path: Path | str) -> Plant:
-    """Load a plant file like `load_plant`.
+    """Return the plant that a file describes; with [serve.fleet] it may have no lines.
 
-    A file that only has the table [serve.fleet] gives an empty plant.
+    Raises PlantError with all mistakes in the file.
     """
     return _load(path, _served_keys)
 
@@ -119,7 +119,7 @@ def port_or_address(name: Path | str) -> str:
     return f"{shown} is a port, not a plant file; `multidrop scan {shown} --out plant.toml` writes one"
 
 
-# one or two slashes, because Path reduces two slashes to one
+# one or two slashes, because a Path turns two slashes into one
 _URL = re.compile(r"([a-z][a-z0-9+.-]+):/{1,2}(.*)", re.IGNORECASE)
 _PORTS = ("tcp", "socket", "rfc2217")
 
@@ -332,10 +332,7 @@ def _model(table: Any, place: TomlPlace) -> type[Drive] | None:
 
 
 def _option_keys(model: type[Drive] | None) -> dict[str, Key]:
-    """Return the keys for the options of a family.
-
-    If the family is unknown, include all families' options.
-    """
+    """Return the keys for the options of a family; if it is unknown, for those of all families."""
     families = [model] if model else list(MODELS.values())
     return {
         name: Key((int, float), f"{name} = {option.span[1]:g}")
@@ -359,7 +356,7 @@ def _try_each(
     settings = model(**least).settings
     right = {"baudrate": str(settings.baudrate), "format": f'"{settings.format}"'}
     for key, value in inherited.items():
-        if key not in right:  # other keys cannot be tried alone
+        if key not in right:  # a silence depends on other keys
             continue
         hint = f" (the line's); add {key} = {right[key]} to this drive"
         place.attempt(partial(model, **(least | {key: value})), hint=hint)

@@ -54,7 +54,7 @@ FLEET_KEYS: Final = {"may": Key(dict, "[fleet.may], a table", keywords=json_sche
 class Polled:
     """A register that is read every `every` seconds; None means as fast as the line allows.
 
-    Raises ValueError unless `every` is from 0.0001 to 86400 s, or None.
+    Raises ValueError unless `every` is None or from 0.0001 to 86400 s.
     """
 
     register: Register[Any]
@@ -115,7 +115,7 @@ class PolledDrive:
 
     @property
     def series(self) -> tuple[Polled, ...]:
-        """The polled registers, and a placeholder register for each channel, which is never read."""
+        """The polled registers, and for each channel a placeholder register that is never read."""
         slowest = max((poll.every or 0.0 for poll in self.polls), default=0.0) or None
         return (*self.polls, *(Polled(channel.register, slowest) for channel in self.channels))
 
@@ -229,10 +229,7 @@ class Plant:
 
 
 def current_for(period: float) -> float:
-    """Return for how many seconds a polled value is valid.
-
-    `period` in s is the register's own period or the line's bus cycle, whichever is longer.
-    """
+    """Return for how many seconds a polled value is valid, if it is read every `period` seconds."""
     return max(1.0, 3 * period)
 
 
@@ -249,8 +246,7 @@ def planned_on(line: PlantLine, delays: Mapping[Drive, float] | None = None) -> 
 def series_of(plant: Plant, planned: Mapping[str, Any] | None = None) -> list[DriveSeries]:
     """Return the registers and channels from which channels are computed; [] if the plant has no channels.
 
-    Each value is valid for the time that `current_for` returns. Pass `plant.metadata()["planned"]` as
-    `planned` if it is known.
+    `planned` is `plant.metadata()["planned"]`; without it, the bus cycles are predicted here.
     """
     if not any(polled.channels for polled in plant.drives):
         return []
@@ -326,8 +322,7 @@ def allowed(plant: Plant, table: Mapping[str, Any], place: TomlPlace) -> dict[st
 def _listed(plant: Plant, key: str, entry: object) -> list[str]:
     """Return the registers or verbs, as "drive.name", that an entry such as "pump-*.start" allows.
 
-    `*` stands for any characters of a drive's name. Drives without the register or verb are skipped. Raises
-    ValueError if no drive has it, or if the entry has another mistake.
+    Matching drives without the register or verb are skipped. Raises ValueError if no drive has it.
     """
     name, dot, rest = entry.rpartition(".") if isinstance(entry, str) else ("", "", "")
     if not dot:
@@ -353,7 +348,7 @@ def _listed(plant: Plant, key: str, entry: object) -> list[str]:
 
 
 def _entry(key: str, drive: Drive, name: object) -> str:
-    """Return "drive.name" if the table `may` can allow this register or verb, else raise ValueError."""
+    """Return "drive.name". Raises ValueError if a table `may` cannot allow this register or verb."""
     entry = f"{drive.name}.{name}"
     if key == "write":
         try:
@@ -375,7 +370,7 @@ def _entry(key: str, drive: Drive, name: object) -> str:
 # ---- names of drives and lines ----
 
 
-# Reserved names and their use: a topic, path, file or key already has this name.
+# Reserved names, each with the topic, path or key that already has the name.
 RESERVED_NAMES: Final[Mapping[str, str]] = {
     "gateway": "the MQTT topic PREFIX/gateway",
     "stop": "the MQTT topic PREFIX/stop, which stops all drives",
@@ -401,11 +396,10 @@ def check_drive_name(name: str) -> bool:
 
 
 def drive_meant(name: str, names: Iterable[str]) -> str:
-    """Return the name in `names` that `name` means.
+    """Return the name in `names` that equals `name`, or that has the same Unicode normal form.
 
-    This is `name` itself if it is in `names`, else the only one with the same Unicode normal form. If there
-    is none, `name` is returned. Use this only for stops and reads: a command that moves a motor must name it
-    exactly.
+    If there is none, or more than one, return `name`. Use this only for stops and reads: a command that moves
+    a motor must name it exactly.
     """
     names = [*names]
     if name in names:

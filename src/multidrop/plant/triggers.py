@@ -11,7 +11,7 @@ from multidrop.channels.grammar import ExpressionError, ReferenceStep, parse
 from multidrop.plant.model import Plant, PolledDrive, series_of
 
 PRE_S, POST_S = 5.0, 10.0  # s recorded before and after a trigger by default
-FAULT = "fault"  # condition that means a fault of any drive, and the name of the register with the fault
+FAULT = "fault"  # the condition for a fault of any drive, and the name of the register with the fault
 
 TriggerSeries = tuple[str, str]  # drive, and name of a register or channel
 
@@ -20,9 +20,9 @@ class TriggerChannels(NamedTuple):
     """A plant with a channel for each condition. A trigger occurs when its channel is no longer 0."""
 
     plant: Plant
-    texts: Mapping[TriggerSeries, str]  # by channel: the text of the trigger
-    numbers: Mapping[TriggerSeries, int]  # by channel: the index of the condition
-    signals: Mapping[str, Sequence[TriggerSeries]]  # by text of the trigger: the registers to show
+    texts: Mapping[TriggerSeries, str]  # text of the condition, by channel
+    numbers: Mapping[TriggerSeries, int]  # index of the condition, by channel
+    signals: Mapping[str, Sequence[TriggerSeries]]  # registers to show, by text of the condition
 
 
 def with_triggers(plant: Plant, conditions: Collection[str]) -> TriggerChannels:

@@ -14,9 +14,8 @@ from multidrop.scan.findings import GUESS, Found
 def candidate(family: type[Drive], settings: Settings, framing: Framing, address: int) -> Drive | None:
     """Return a drive object of the family with these settings; None if its manual does not allow them.
 
-    A drive can answer in the sweep's serial format although its own format has other stop bits (on a
-    pseudo-terminal: another parity). If the family does not allow the sweep's format, the drive object gets
-    the family's usual format.
+    If the family does not allow the sweep's format, the drive object gets the family's usual format: a drive
+    also answers requests with another number of stop bits.
     """
     if not family.speaks(framing) or address not in family.addresses:
         return None

@@ -45,14 +45,14 @@ MOST_READINGS = 3  # number of readings that a drive must answer if its family h
 NOISY = 1 / 3  # invalid bytes count as noise if more than this share of a sweep's addresses has them
 LEAST_NOISY = 4  # if fewer addresses than this have invalid bytes, the bytes never count as noise
 BEGUN = 2  # number of received characters after which a reply counts as started
-LATE = 8  # a reply may come this many requests late, and is still matched to its request
-MOST_TIMEOUT = 1.0  # limit of the timeout in s, used only for an address at which a drive has answered
+LATE = 8  # a late reply is matched to one of this many earlier requests
+MOST_TIMEOUT = 1.0  # limit of the timeout in s for an address at which a drive has answered
 TRIES = 3
 LATE_NS = 500_000_000  # longest wait for late replies, in ns
 SHORTEST_REPLY = 5  # size of an exception reply in bytes; fewer bytes are noise
 
 SILENT = (Failure.NO_REPLY, Failure.STALLED)  # results of exchanges in which no byte was received
-# Results that mean that a frame answers another request.
+# results for a frame that answers another request
 _MISDIRECTED = (FrameFault.BAD_ADDRESS, FrameFault.BAD_FUNCTION, FrameFault.BAD_LENGTH)
 
 
@@ -95,8 +95,7 @@ class _Scan:
 
     def _sweep(self, sweep: Sweep, left_after: float) -> Iterator[Finding]:
         addresses = [address for address in sweep.addresses if _key(sweep, address) not in self._found]
-        # Maps an address with invalid replies to a whole frame that did not match the request, with the
-        # reason; to "" if no frame was whole.
+        # by address with invalid replies: a whole frame that does not match its request, and why; or ""
         garbled: dict[int, str] = {}
         peers: dict[int, Peer] = {}
         for number, address in enumerate(addresses, 1):
@@ -112,7 +111,7 @@ class _Scan:
             came = completion.result not in SILENT
             earlier = addresses[max(0, number - 1 - LATE) : number - 1]
             late = [before for before in earlier if before in peers and peers[before].late]
-            for suspect in late:  # the C core has matched a late reply to this address
+            for suspect in late:  # an address to which the C core has matched a late reply
                 del peers[suspect]
             late += _late(sweep, earlier, completion)
             for suspect in late + [address] * came:
@@ -168,9 +167,9 @@ class _Scan:
         return completion
 
     def _sweep_peer(self, sweep: Sweep) -> Peer:
-        """Return a peer with a timeout that is too short for a whole reply, but not for its first characters.
+        """Return a peer with a timeout that is long enough for the first characters of a reply.
 
-        These suffice to find an address that answers. The scan then repeats the request with more time.
+        They suffice to find an address that answers. The scan then repeats the request with more time.
         """
         settings = sweep.settings
         length = reply_length(sweep.framing, sweep.request.to(sweep.addresses[0]))
@@ -184,10 +183,7 @@ class _Scan:
 
 
 def _key(sweep: Sweep, address: int) -> tuple[int, Framing, int]:
-    """Return the key by which the scan recognises a drive.
-
-    It lacks the serial format, so that a drive that answers in several formats is reported once.
-    """
+    """Return the key of a drive, without the format: a drive may answer in several formats."""
     return address, sweep.framing, sweep.settings.baudrate
 
 
@@ -218,10 +214,7 @@ def is_whole(framing: Framing, received: bytes) -> bool:
 
 
 class _Probe:
-    """Finds out whether a drive answers at an address, and its family.
-
-    Also finds out whether a second drive answers at the same address.
-    """
+    """Finds out whether one or several drives answer at an address, and their family."""
 
     def __init__(self, scan: _Scan, sweep: Sweep, address: int) -> None:
         self._scan = scan
@@ -256,7 +249,7 @@ class _Probe:
         # The drive's response delay is known, so a short timeout is enough.
         known = max(LEAST_TIMEOUT, 4 * self.response_delay)
         drives, guess = self._identify(families, LEAST_TIMEOUT, known)
-        # a missed reply shows that the drive or this computer became slower
+        # after a missed reply, the drive or this computer may be slower than assumed
         if self._has_missed and not self._is_in_step():
             drives, guess = self._identify(families, MOST_TIMEOUT, MOST_TIMEOUT)
         documented = max((drive.response_delay for drive in drives), default=LEAST_TIMEOUT)

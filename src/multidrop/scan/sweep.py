@@ -24,8 +24,8 @@ Setting = tuple[Settings, Framing]
 GATEWAY_PATIENCE = 1.0
 ADDRESSES = range(1, 32)  # the addresses that a scan tries by default
 _ILLEGAL_ADDRESS = 2  # code of the Modbus exception "illegal data address"
-# In tables with these carriers, a reply with the value 0 is the same as an echo of the request. So a sweep
-# prefers registers of other tables, or the register with the drive's own address, which never holds 0.
+# In these tables, a reply with the value 0 equals an echo of the request. So a sweep prefers registers of
+# other tables, or the register with the drive's own address, which is never 0.
 _ECHOED = (Carrier.LONG, Carrier.NUMBER)
 
 
@@ -102,7 +102,7 @@ def sweeps(
 
 
 def one_of_each_framing(planned: Sequence[Sweep]) -> list[Sweep]:
-    """Return two sweeps of each request, with a short and a long timeout, for a port with a fixed format."""
+    """Return two sweeps of each request, with a short and a long timeout, for a port of fixed format."""
     brisk: dict[tuple[Framing, ScanRequest], Sweep] = {}
     patient: dict[tuple[Framing, ScanRequest], Sweep] = {}
     for sweep in planned:

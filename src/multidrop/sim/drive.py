@@ -52,7 +52,7 @@ class Refusal(Exception):
 
 @dataclass(frozen=True)
 class DriveProtocol:
-    """A protocol's functions and default exception codes.
+    """The functions of a protocol, and its exception codes by reason.
 
     Without a code for a reason, the drive does not reply.
     """
@@ -176,7 +176,7 @@ DELIXI = DriveProtocol(
 PROTOCOLS = {Framing.RTU: MODBUS, Framing.ASCII: MODBUS, Framing.TCP: MODBUS, Framing.DELIXI: DELIXI}
 
 
-MOST_REMEMBERED = 10_000  # limit of the recorded writes of a drive, to save memory
+MOST_REMEMBERED = 10_000  # limit of a drive's recorded writes, to save memory
 # by function code of a write: the function code of a read with the same length limit
 _COUNTED_AS = {0x06: 0x03, 0x10: 0x03}
 # Longest silence within a frame, in s. Sources: the Modbus serial-line guide, 2.5.2.1; the third part of
@@ -211,7 +211,7 @@ class DriveCounters:
 def _most_cells(drive: Drive) -> dict[int, int]:
     """Return the largest number of cells in one request, by the function code of reads.
 
-    A register that is longer than the family's limit can still be read whole.
+    A register that is longer than the family's limit is still read whole.
     """
     most: dict[int, int] = {}
     held = [(register.table, len(register.reach)) for register in drive.registers.values()]
@@ -272,7 +272,7 @@ class SimulatedDrive:
         """Advance the drive's state to the time `now`."""
 
     def refresh(self, cell: MemoryCell) -> None:
-        """Set the cell to the value that a read returns at the time `self.now`."""
+        """Set the cell to the value that a read returns now (`self.now`)."""
 
     def accept(self, cell: MemoryCell, raw: int) -> int:
         """Return the raw count to store when `raw` is written. Raises Refusal if the drive rejects it."""
@@ -285,7 +285,7 @@ class SimulatedDrive:
         return raw
 
     def _accept_long(self, raws: Mapping[MemoryCell, int]) -> None:
-        """Raise Refusal if a write of all words of a register sets a value outside the register's limits."""
+        """Raise Refusal if a write sets a value of several words outside the limits of its register."""
         for register in {cell.register for cell in raws if cell.register and cell.register.words > 1}:
             cells = self.memory.of(register)
             if all(cell in raws for cell in cells):
@@ -305,10 +305,7 @@ class SimulatedDrive:
 
     @property
     def delay(self) -> float:
-        """The time in s from the request's end to the reply's start.
-
-        It is at least the silence after a frame.
-        """
+        """Time in s from the end of a request to the start of the reply."""
         return max(self.response_delay, self.silence)
 
     @property
@@ -431,15 +428,12 @@ class SimulatedDrive:
 
 
 def encoded(address: int, table: Table, register_address: int) -> int:
-    """Return the raw count of an EncodedDrive with this address, for a register at this address of a table.
-
-    A coil has the lowest bit of the count.
-    """
+    """Return the raw count of a register of an EncodedDrive; a coil has its lowest bit."""
     return (address * 257 + register_address * 31 + (table.read or table.write or 0)) & 0x7FFF
 
 
 def proof(drive: Drive, register: Register[Any]) -> float:
-    """Return the value that a read of this register from an EncodedDrive must return; NaN for "no value"."""
+    """Return the value that a read of this EncodedDrive's register must return; NaN for "no value"."""
     if register in drive.known_counts():
         return register.coding.value_of(_known(drive, register))
     size = 2 if register.table.carrier is Carrier.WORD else 4

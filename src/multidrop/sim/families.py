@@ -109,7 +109,7 @@ DELIXI_BAUDRATES = (1200, 2400, 4800, 9600, 19200, 38400)  # baud rates, indexed
 # character formats, indexed by P04.29: three of ASCII, then three of RTU
 DELIXI_MODBUS_FORMATS = ("7N2", "7E1", "7O1", "8N2", "8E1", "8O1")
 DELIXI_NATIVE_FORMATS = ("8N1", "8E1", "8O1")
-# valid values of the run command (K = 02), and those that start the motor
+# the run commands (K = 02), and those of them that start the motor
 DELIXI_COMMANDS, DELIXI_STARTS = range(1, 5), (2, 3)
 DELIXI_RUN_SOURCE, DELIXI_FREQUENCY_SOURCE = 0, 1  # indexes of the parameters P00.00 and P00.01
 DELIXI_BY_LINE = {DELIXI_RUN_SOURCE: 2, DELIXI_FREQUENCY_SOURCE: 1}
@@ -211,7 +211,7 @@ class SimulatedDelixiNative(MotorDrive):
 
 
 def _printed(fault: int) -> int:
-    """Return the raw count whose hex digits are the fault number's decimal digits: 00000010H for fault 10."""
+    """Return the fault number as the document prints it in hex digits: 00000010H for fault 10."""
     return int(str(fault), 16)
 
 
@@ -442,7 +442,7 @@ class SimulatedYD1000(MotorDrive):
 
     _panel_runs = False
     _in_force = 0  # the control word that was accepted last
-    _message_at = math.inf  # time of the last message in s; inf: there was none, so that no timeout can occur
+    _message_at = math.inf  # time of the last message in s; inf: none yet, so that no timeout can occur
 
     def prepare(self) -> None:
         self.memory.make_readable(HOLDING, [YD_CONTROL])

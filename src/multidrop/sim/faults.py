@@ -69,9 +69,8 @@ class DriveFaults:
 class Faults:
     """Rates of a simulated line's faults, and the faults of its drives, by drive name.
 
-    At most one of `drop`, `flip` and `repeat` happens to a frame. So the checksum of every framing detects
-    the fault. A reply that comes after the response timeout looks like the reply to the next identical
-    request.
+    A frame has at most one of the faults `drop`, `flip` and `repeat`, so that every checksum detects it. A
+    reply that comes after the response timeout looks like the reply to the next identical request.
     """
 
     seed: int = _whole(0, "the same one brings the same faults", "7")
@@ -169,8 +168,8 @@ DRIFT_S = 20.0  # s of one cycle of a load that changes slowly
 class FaultyWire(Wire):
     """A wire with `faults`, which may change at any time. `struck` counts the faults that have occurred.
 
-    The fault `hang_up` removes the port. It needs a TCP port, or a link to a pty: a pty without a link cannot
-    be reopened under its name.
+    The fault `hang_up` removes the port. It needs a TCP port, or a link to a pty, because a pty alone cannot
+    be opened again under its name.
     """
 
     def __init__(
@@ -251,7 +250,7 @@ class FaultyWire(Wire):
             sim.motor.load = mean + faults.drift * math.sin(now * math.tau / DRIFT_S + sim.drive.address)
 
     def _is_due(self, drive: str, event: str, faults: DriveFaults, now: float) -> bool:
-        """Return True once per period of this event."""
+        """Return True once in each period of this event."""
         period: float | None = getattr(faults, event)
         if not period:
             return False

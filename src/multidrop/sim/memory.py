@@ -48,7 +48,7 @@ class Memory:
     def __init__(self, drive: type[Drive], framing: Framing) -> None:
         self._framing = framing
         self._also = _DELIXI_ALSO_WRITES if framing is Framing.DELIXI else _ALSO_WRITES
-        # cells by read function and address, because tables with the same read function share their cells
+        # by read function and address, because tables with the same read function share their cells
         self._cells: dict[tuple[object, int], MemoryCell] = {}
         # cells by function and address; None: a read that includes this address is refused
         self._read: dict[tuple[int, int], MemoryCell | None] = {}
@@ -164,12 +164,12 @@ class Memory:
             cell.raw = int.from_bytes(data[size * at : size * (at + 1)]) & _MASKS[register.table.carrier]
 
     def get_text(self, text: Text) -> str:
-        """Return the text stored in its registers, as a read decodes it."""
+        """Return the characters in the registers of this text, up to the first NUL."""
         cells = (self._cell(text.table, address) for address in self._addresses(text))
         return text.decode(b"".join(pack(cell.table, cell.raw) for cell in cells))
 
     def set_text(self, text: Text, value: str) -> None:
-        """Store a text in its registers. Raises ValueError if it does not fit."""
+        """Store characters in the registers of this text. Raises ValueError if they do not fit."""
         data = text.encode(value)
         for at, address in enumerate(self._addresses(text)):
             self._cell(text.table, address).raw = int.from_bytes(data[2 * at : 2 * at + 2])
@@ -191,7 +191,7 @@ def _space(table: Table) -> object:
 def _is_better(register: Register[Any], known: Register[Any] | None) -> bool:
     """Return True if `register` should replace the register `known` of a cell.
 
-    Writable registers take precedence, then registers that use all bits of their words.
+    A writable register takes precedence, then a register that uses all bits of its words.
     """
     if known is None or register.access is not Access.READING:
         return True

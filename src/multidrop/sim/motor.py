@@ -23,7 +23,7 @@ BRAKING_TORQUE = 0.3
 SLIP = 0.04  # relative slip at the rated torque
 HEATING = 35.0  # rise of the heatsink temperature at the rated current, in K
 WARMING_TIME = 120.0  # thermal time constant of the heatsink in s
-RUN_OUT_TIME = 10.0  # s in which the motor coasts from the rated frequency to rest
+RUN_OUT_TIME = 10.0  # time in s in which the motor coasts from the rated frequency to rest
 REGENERATION = 0.06  # relative rise of the DC bus voltage while the motor brakes
 SAG = 0.02  # relative fall of the DC bus voltage at the rated current
 
@@ -72,7 +72,7 @@ class Motor:
         self.run_seconds = 0.0
         self.fault = 0
         self.faults: deque[int] = deque(maxlen=4)  # fault codes, the latest first
-        self._goal: float | None = 0.0  # frequency in Hz at which the present ramp ends; None: at `target`
+        self._goal: float | None = 0.0  # frequency in Hz at the end of the ramp; None: `target`
         self._brakes = False  # True while the motor is held with direct current
 
     def run(self, direction: int | None = None) -> None:
@@ -258,10 +258,9 @@ _SETTINGS = ("acceleration_time", "deceleration_time", "maximum_frequency")
 class MotorDrive(SimulatedDrive):
     """A simulated drive with a motor. A register that is set with `drive[name] = value` keeps that value.
 
-    Registers with common names need no code. A setting such as `acceleration_time` configures the motor, and
-    a reading such as `output_current` shows its state. For other registers, a family has functions by
-    register name: `write_handlers` get the raw count that was written, `read_handlers` return the raw count
-    to read.
+    Settings such as `acceleration_time` configure the motor, and readings such as `output_current` show its
+    state. Other registers have functions, by register name: `write_handlers` get the raw count that was
+    written, and `read_handlers` return the raw count to read.
     """
 
     write_handlers: ClassVar[Mapping[str, Callable[[Any, int], None]]] = {}

@@ -27,8 +27,8 @@ def is_dead_link(link: Path) -> bool:
 class PtyPort:
     """A pty whose other end a client opens by its path.
 
-    This object keeps the client's end open, so that the pty outlives its clients. Of a client's settings,
-    only the baud rate has an effect: a pty stores no parity.
+    This object keeps the client's end open, so that the pty remains when a client closes it. Of a client's
+    settings, only the baud rate has an effect, because a pty stores no parity.
     """
 
     def __init__(self, settings: Settings, link: Path | None) -> None:

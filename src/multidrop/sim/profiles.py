@@ -77,7 +77,7 @@ class ProfileDrive(MotorDrive):
             self.memory.set(register, self.memory.get(self.drive.register("reference")))
 
     def rises(self, word: int, bits: int) -> bool:
-        """Return True if this control word sets one of the bits, and the previous one set none of them."""
+        """Return True if this control word sets one of the bits that the previous word had at 0."""
         return bool(word & bits) and not self.word_before & bits
 
     def power_cycle(self) -> None:
@@ -108,9 +108,9 @@ class SimulatedProfidrive(ProfileDrive):
 
     A control word in which OFF1 is active, but not OFF2 or OFF3, allows it again.
 
-    `off2` and `off3` are commands from another source, such as a terminal. In local control, or if the word's
-    remote bit is 0, only the OFF bits have an effect. A word that clears bit 3 lets the motor coast. The
-    three ramp bits are simulated only in part: the motor runs if all three are 1.
+    `off2` and `off3` are commands from another source, such as a terminal. In local control, or if bit 10 of
+    the word is 0, only the OFF bits have an effect. A word that clears bit 3 lets the motor coast. Of the
+    three ramp bits it is only simulated that the motor runs if all are 1.
     """
 
     off2 = off3 = False

@@ -1,7 +1,7 @@
 """Split received bytes into requests, as a drive does. The input is bytes with times, the output is frames.
 
-Invalid bytes affect only the frames that they damage. Buffers are bounded. Silence ends an RTU frame, so
-bytes that follow a request without a pause damage it, unless they start another request.
+Invalid bytes affect only the frames that they damage. Buffers have a limited size. Bytes that follow an RTU
+request without a pause damage it, unless they start another request.
 """
 
 from __future__ import annotations
@@ -45,8 +45,7 @@ class Frame:
 class Receiver:
     """Receives frames of one framing and baud rate. A silence of `most_gap` s ends a frame.
 
-    `character` is the transmission time of a character in s; 0 on a line that is simulated without
-    timing.
+    `character` is the time of a character in s; 0 on a line without timing.
     """
 
     def __init__(self, framing: Framing, character: float, most_gap: float) -> None:
@@ -76,7 +75,7 @@ class Receiver:
         return frames
 
     def silence(self, now: float) -> list[Frame]:
-        """Return [frame] if the silence until `now` ended a frame that is not a valid request; else []."""
+        """Return the damaged frame that a silence has ended, in a list that is empty without one."""
         if not self._buffer or now < self._end + self.most_gap:
             return []
         rest = bytes(self._buffer)
@@ -99,8 +98,8 @@ class Receiver:
     def _cut_rtu(self) -> Frame | None:
         """Return the next request; None if there is none yet.
 
-        Other bytes that follow a request damage it, unless they start another request. While too few of these
-        bytes have arrived to decide, return None.
+        Bytes that follow a request damage it, unless they start another request. They may be too few to
+        decide; then return None too.
         """
         data = bytes(self._buffer[-MOST_RTU:])
         while (found := _first_request(data)) is not None:
@@ -164,8 +163,8 @@ class Receiver:
 def _first_request(data: bytes) -> tuple[int, int, Message] | None:
     """Return index, length and message of the first valid request in `data`; None if there is none.
 
-    Valid bytes may lie inside a longer request that is still incomplete. While an earlier byte may be the
-    start of such a request, return only a request that ends at the end of `data`.
+    The valid bytes may be a part of a longer request, which is still incomplete. If an earlier byte may start
+    such a request, return only a request that ends at the end of `data`.
     """
     pending = False
     for at, code in enumerate(data[1:]):

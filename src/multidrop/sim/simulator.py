@@ -43,7 +43,7 @@ class Simulator:
         self._is_over = False
         self._is_open = False
         self._wakes: list[tuple[float, int]] = []  # heap of pairs: wake-up time in s, index of the wire
-        # By index of the wire: the time of its next wake-up. Other times in the heap no longer apply.
+        # by index of the wire: the time of its next wake-up; other times in the heap are obsolete
         self._planned: dict[int, float] = {}
         # by index of the wire: the port that the selector observes, and its descriptor
         self._attended: dict[int, tuple[SimulatedEnd, int]] = {}
@@ -106,10 +106,7 @@ class Simulator:
             raise
 
     def forked(self) -> None:
-        """Create new wake-up sockets in a forked child.
-
-        With the old ones it would wake its parent's simulator.
-        """
+        """Create new wake-up sockets in a forked child, because the old ones wake the parent's simulator."""
         self._interrupted, self._interrupter = socket.socketpair()
 
     def close(self) -> None:
@@ -125,7 +122,7 @@ class Simulator:
 
     @property
     def wakeup(self) -> int:
-        """A descriptor: writing a byte to it makes `run` return."""
+        """A file descriptor; a byte that is written to it makes `run` return."""
         return self._interrupter.fileno()
 
     def run(self) -> None:
@@ -151,11 +148,8 @@ class Simulator:
         return monotonic() * self._speed
 
     def _sleep(self) -> None:
-        """Wait until bytes are received, or until the next wake-up time.
-
-        This calls select() on the selector's own descriptor, because select() is accurate to a microsecond,
-        but epoll_wait() only to a millisecond.
-        """
+        """Wait until bytes are received, or until the next wake-up time."""
+        # select() on the selector's own descriptor is more accurate than epoll_wait(): to 1 us, not 1 ms
         limit = max(0.0, self._wakes[0][0] - self._now()) / self._speed if self._wakes else None
         if isinstance(self._selector, selectors.SelectSelector):
             self._selector.select(limit)

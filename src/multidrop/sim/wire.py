@@ -16,8 +16,8 @@ from multidrop.sim.drive import SimulatedDrive
 from multidrop.sim.port import SimulatedEnd, open_port
 from multidrop.sim.receiver import Frame, Receiver
 
-CHUNK = 1e-3  # s; characters that end within this time of each other are delivered together
-ROUNDING = 1e-6  # fraction of a character's time: rounding errors below this do not delay a byte
+CHUNK = 1e-3  # s; characters that end within this time are delivered together
+ROUNDING = 1e-6  # rounding errors below this fraction of a character's time do not delay a byte
 UNPACED_GAP = 20e-3  # s of silence that end a frame on an unpaced wire
 
 
@@ -52,7 +52,7 @@ class Transmission:
 
 
 class ReceiverGroup:
-    """Drives that receive the same frames: they have the same framing, baud rate and longest silence."""
+    """Drives with the same framing, settings and longest silence, which receive the same frames."""
 
     def __init__(self, receiver: Receiver, settings: Settings) -> None:
         self.receiver = receiver
@@ -60,6 +60,7 @@ class ReceiverGroup:
         self.drives: dict[int, SimulatedDrive] = {}
 
     def addressed(self, frame: Frame) -> Sequence[SimulatedDrive]:
+        """Return the drives that a frame addresses; a broadcast addresses all."""
         if frame.address == 0 and self.receiver.framing is not Framing.TCP:
             return list(self.drives.values())
         return [self.drives[frame.address]] if frame.address in self.drives else []
@@ -169,11 +170,10 @@ class Wire:
         bisect.insort(self._outgoing, Transmission(data, begin, character), key=lambda reply: reply.begin)
 
     def _keeps_silence(self, sim: SimulatedDrive, frame: Frame) -> bool:
-        """Return True if the drive accepts the frame. A frame that came too soon after a reply is counted.
+        """Return True if the drive accepts the frame; count a frame that came too soon after a reply.
 
-        A frame that starts during a reply is lost. Silence is measured only from the end of the simulator's
-        own replies, whose time it knows exactly. So a late wake-up of this process never makes a frame count
-        as early.
+        The silence counts from the end of the simulator's own reply, whose time is known exactly. So a late
+        wake-up of this process never makes a frame count as early.
         """
         replying = self._outgoing and self._outgoing[0].begin <= frame.begin
         silent_for = frame.begin - (self._outgoing[0].end if replying else self._quiet_since)

@@ -113,8 +113,8 @@ def test_all_mistakes_in_a_family_with_a_profile_are_reported_together() -> None
 
     assert set(wrong.value.mistakes) == {
         "control: in this profile it is a command, not a setting",
-        "control: harmless is what the profile itself says; leave it out",
-        "control: its values are what the profile itself says; leave it out",
+        "control: harmless is set by the profile; leave it out",
+        "control: values is set by the profile; leave it out",
         "status: it is one word of bits, without a unit and a step",
         "reference: its unit is 'rpm'; this profile takes 'Hz' or '%'",
         "reference: a reference below 0 may turn the motor the other way; its span begins at 0",

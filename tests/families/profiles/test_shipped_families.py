@@ -471,7 +471,7 @@ def test_all_mistakes_of_a_family_file_with_a_profile_are_reported_together(tmp_
     for sentence in (
         'formats has "7N1", and an RTU frame needs 8 data bits',
         "[verb] is not supported; name a profile",
-        "[command] control: harmless is what the profile itself says",
+        "[command] control: harmless is set by the profile",
         "[reading] status: it is one word of bits",
         "reference: this profile needs a register of this name",
         "reset: this profile needs",

@@ -102,7 +102,7 @@ class Invt(Profile):
     def _check_start(self, status: int) -> Script[None]:
         yield from super()._check_start(status)
         if self._jogged and not (yield from self._is_at_rest()):
-            raise self._stop_first(f"{self.name} may still jog, and a start may not end the jog:")
+            raise self._stop_first(f"{self.name} may still jog, and a start may not end the jog")
         self._jogged = False
 
     @verb

@@ -24,7 +24,7 @@ from multidrop.drive.register import Access, Carrier, Register
 from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.verbs import Script, insist, read, until, verb, write
 
-_CODED = "what the profile itself says; leave it out"
+_BY_PROFILE = "set by the profile; leave it out"
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ COMMON: Mapping[str, Role] = {  # registers of all profiles, besides `control` a
 def own_errors(
     name: str, register: Register[Any], roles: Mapping[str, Role], taken: Collection[str]
 ) -> Iterator[str]:
-    """Yield the errors in one register of a family. `taken` are names that profiles reserve."""
+    """Yield the errors in one register of a family; `taken` are the reserved names."""
     if name in roles:
         yield from role_errors(name, roles[name], register)
     elif name in taken:
@@ -100,7 +100,7 @@ def role_errors(name: str, role: Role, register: Register[Any]) -> Iterator[str]
         yield f"{name}: in this profile it is a {wanted}, not a {register.access.value}"
     for fact in ("harmless", "never_together", "moves", "never"):
         if getattr(register, fact) not in (None, ()) and getattr(register, fact) != "":
-            yield f"{name}: {fact} is {_CODED}"
+            yield f"{name}: {fact} is {_BY_PROFILE}"
     if role.is_word:
         yield from _word_errors(name, role, register)
     elif role.units and register.unit not in role.units:
@@ -125,7 +125,7 @@ def _word_errors(name: str, role: Role, register: Register[Any]) -> Iterator[str
     if role.renumbered:
         yield from _renumbering_errors(name, role, register.values)
     elif not role.extra:
-        yield f"{name}: its values are {_CODED}"
+        yield f"{name}: values is {_BY_PROFILE}"
     elif unknown := [member.name for member in register.values if member.name.lower() not in role.extra]:
         yield f"{name}: bits may only add {known}, not {', '.join(unknown)}"
     else:
@@ -290,10 +290,7 @@ class Profile(Drive):
         return None
 
     def _reverses(self, direction: Direction | None, status: int) -> bool:
-        """Return True if a start or jog in this direction turns the motor in reverse.
-
-        None means: keep the direction of a turning motor.
-        """
+        """Return True for a start or jog in reverse; None means the direction of a turning motor."""
         if direction is None:
             return self._turns(status) and self._direction(status) is Direction.REVERSE
         return direction is Direction.REVERSE
@@ -339,12 +336,13 @@ class Profile(Drive):
             return
         held = yield from read(shown)
         if held == 0:
-            why = f"the setpoint of {self.name} is 0:"
+            problem = f"the setpoint of {self.name} is 0:"
         elif held != self.commanded and not self.reference.readable:
-            why = f"{self.name} follows {shown.format(held)}, not the setpoint that was written;"
+            problem = f"{self.name} follows {shown.format(held)}, not the setpoint that was written;"
         else:
             return
-        raise WriteForbidden(f"{why} call set_frequency before start", advice=Advice.call("set_frequency"))
+        way = Advice.call("set_frequency")
+        raise WriteForbidden(f"{problem} call set_frequency before start", advice=way)
 
     # ---- verbs ----
 
@@ -402,7 +400,7 @@ class Profile(Drive):
         status = yield from self._status()
         yield from self._check_start(status)
         if self._turns(status):  # the manuals do not define a jog while the motor turns
-            raise self._stop_first(f"{self.name} turns, and may continue to turn during a jog:")
+            raise self._stop_first(f"{self.name} turns, and may continue to turn during a jog")
         return self._word(reverse if self._reverses(direction, status) else forward)
 
     def _word(self, count: int, role: str = "control") -> Any:
