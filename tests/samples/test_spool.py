@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import spooled
@@ -23,7 +24,7 @@ from lines import until
 from spooled import exchanges_in, numbered, rows_in, rows_of
 
 from multidrop.samples import spool as spool_module
-from multidrop.samples.message import unpack
+from multidrop.samples.message import Packed, RowBuffer, unpack
 from multidrop.samples.spool import Spool, SpoolError, SpoolFolder
 
 GATEWAY = "gateway-1"
@@ -347,6 +348,24 @@ def test_a_hanging_disk_does_not_delay_the_poller(spool: Spool, monkeypatch: pyt
     assert spool.following(0) is None
     goes_on.set()
     assert spool.sync(30.0)
+
+
+def test_rows_counted_as_lost_are_not_written(
+    spool: Spool, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    really = RowBuffer.messages
+
+    def messages(self: RowBuffer, **options: Any) -> Iterator[Packed]:
+        yield from really(self, **options)
+        raise MemoryError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(RowBuffer, "messages", messages)
+        spool.append(numbered(0, 30))
+        spool.sync(0.0)
+        until(lambda: spool.state().lost == 300)
+    store(spool, 30, 30)
+    assert exchanges_in(rows_in(folder)) == list(range(30, 60))
 
 
 # ---- mistakes ----

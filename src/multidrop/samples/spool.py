@@ -330,7 +330,7 @@ class Spool:
 
     def _pack(self, buffer: RowBuffer) -> None:
         try:
-            self._packed += buffer.messages(units=self._units)
+            self._packed += list(buffer.messages(units=self._units))  # all messages or none
         except Exception:  # a bug here must not end the thread
             _log.exception("%d rows could not be packed", buffer.rows)
             with self._changing:
