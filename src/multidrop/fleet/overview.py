@@ -98,8 +98,7 @@ class FleetView:
 
     def _lines(self, sessions: Container[str]) -> dict[str, Any]:
         observer, plant = self._records.observer, self._records.plant.records
-        # by owner: whether its session is alive; saves repeated checks
-        held: dict[tuple[str, int], bool] = {}
+        held: dict[tuple[str, int], bool] = {}  # by owner: True if its session is alive
         found: dict[str, Any] = {}
         for name in self._records.lines():
             record = self._records.owner(name)

@@ -27,7 +27,7 @@ EXAMPLE = "nats://127.0.0.1:4222"
 OLD_S = 5.0  # if the view of the fleet is older than this, the page reports a problem
 AGAIN_S = 1.0  # pause between attempts to connect as a commander
 LOG = "fleet-commands.jsonl"
-WHOLE = "the fleet"  # name of all drives together in the answer to a stop
+WHOLE = "the fleet"  # key of the result for the whole fleet in the answer to a stop
 NO_COMMANDER = (
     "the stop was NOT sent: [serve.fleet] has no commander; use `multidrop fleet stop` or the hard-wired stop"
 )
@@ -155,7 +155,7 @@ class FleetPart:
 
 
 class HasFolder(Protocol):
-    """The attribute of the gateway's PartContext that this part uses."""
+    """The attributes of the gateway's PartContext that this part uses."""
 
     folder: Path  # relative file names start from this folder
     plant: Plant

@@ -317,7 +317,7 @@ Handler = Callable[[bytes], Awaitable[Offered | CommandAnswer | None]]
 
 
 class CommandSubjects:
-    """A gateway's NATS subscriptions for commands and stops, from its start to its shutdown."""
+    """A gateway's NATS subscriptions for commands and stops."""
 
     def __init__(self, gateway: str, paths: Sequence[ServerPath], lines: HeldLines, log: CommandLog) -> None:
         self._paths = paths
@@ -326,7 +326,7 @@ class CommandSubjects:
         self._stops = StopDesk(gateway, lines, self.desk.offers, log)
 
     async def begin(self) -> None:
-        """Subscribe to the subject on which senders return the tokens of offers."""
+        """Subscribe to the subject on which senders confirm offered commands."""
         await self._subscribe(self.desk.subject, self.desk.do)
 
     def open(self, line: str, description: Any) -> None:

@@ -1,4 +1,4 @@
-"""FleetCommands: send commands and stops to the master of a drive's line, and wait for their results."""
+"""FleetCommands: send commands and stops to the gateway that polls a drive, and wait for their results."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from multidrop.supervisor import Ended, end_tasks, reason_of
 
 LOST_S = 6.0  # time limit without any answer, after which a command's result is reported as unknown
 AGAIN_S = 0.2
-# how long a stop waits for a new master: a change of masters takes 1 s, or 4 s if a gateway died
+# how long a stop waits until a gateway polls the line again: this takes 1 s, or 4 s if a gateway died
 NO_MASTER_S = 6.0
 HARD_WIRED = "use the hard-wired stop"
 

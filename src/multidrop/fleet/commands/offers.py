@@ -1,4 +1,4 @@
-"""Offers: commands that a line's master has checked, and will carry out if confirmed within a second.
+"""Offers: commands that a gateway has checked, and carries out if their sender confirms within a second.
 
 Each offer is carried out at most once. Offers are kept only in memory, so a restarted gateway never carries
 out an offer that it made before the restart.
@@ -104,7 +104,7 @@ class Offer:
 
 
 class Offers:
-    """The offers that this gateway process has made. `clock` returns CLOCK_BOOTTIME in ns."""
+    """The commands that this process has offered to carry out. `clock` returns CLOCK_BOOTTIME in ns."""
 
     def __init__(self, clock: Callable[[], int]) -> None:
         self._clock = clock

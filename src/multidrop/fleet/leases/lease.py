@@ -38,7 +38,7 @@ class HeldRecord(NamedTuple):
     """This gateway's lease record in one of the three lease buckets."""
 
     revision: int
-    sent: int  # when its renewal was sent (CLOCK_BOOTTIME, ns)
+    sent: int  # when the gateway sent the renewal that wrote this revision (CLOCK_BOOTTIME, ns)
 
 
 class Lease:
@@ -96,7 +96,7 @@ class Lease:
 
     @property
     def is_over(self) -> bool:
-        """Return True if the session cannot be renewed, because it has too few valid lease records."""
+        """Return True if too few lease records are left to renew the session."""
         return sum(path is not None for path in self.held) < self.terms.needed
 
     @property

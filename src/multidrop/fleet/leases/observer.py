@@ -148,7 +148,7 @@ class Observer:
         return not is_ended_by_another(record) or self._is_stale(path, record, now)
 
     def unseen_s(self, gateway: str) -> float:
-        """Return for how many seconds this gateway has not renewed two of its lease records."""
+        """Return the time in s since this gateway was last seen to renew two of its lease records."""
         seen = [watched[gateway].since for watched in self._watched if gateway in watched]
         latest = sorted(seen, reverse=True)[: self.terms.needed]
         return (self._clock() - latest[-1]) / lease_rules.SECOND if latest else 0.0

@@ -356,7 +356,7 @@ class OwnerRecords:
 
     def _leaderless(self) -> set[str]:
         """Return the ownership buckets whose NATS server seems to have failed."""
-        # the same server has a lease bucket, so this gateway's record there is not renewed
+        # a failed server also ends the renewals in its lease bucket
         sent = [path.sent if path else 0 for path in self._lease.held]
         since = sorted(sent)[1] - LAG_NS
         return {bucket for bucket, moment in zip(names.OWNERS, sent, strict=True) if moment < since}

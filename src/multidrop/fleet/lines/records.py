@@ -48,9 +48,8 @@ class FleetRecords:
             for bucket in names.OWNERS
         }
         self._of: dict[str, dict[str, Record | None]] = {}  # ownership records, by line and bucket
-        # lines that have an ownership record of a session, by session
-        self._owned: dict[Owner, set[str]] = {}
-        self._masters: dict[str, tuple[str, int]] = {}  # by line: its master, and the turn of its records
+        self._owned: dict[Owner, set[str]] = {}  # by session: lines with an ownership record of it
+        self._masters: dict[str, tuple[str, int]] = {}  # by line: its master, and the number of its last move
         self.plant = Follower(Bucket(names.PLANT, path), self._note_plant)
         self._has_plant_changed = False
         self._lines: tuple[str, ...] = ()

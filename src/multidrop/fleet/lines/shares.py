@@ -35,7 +35,7 @@ LOST_NS = 6 * SECOND
 REPLY_NS = 3 * SECOND  # a reply older than this does not show when the port was lost
 # first and longest wait before a gateway again tries to open a line that it has reported
 FIRST_WAIT_NS, LAST_WAIT_NS = 120 * SECOND, 24 * 3600 * SECOND
-# a trial of a reported line ends if the line is not assigned to this gateway again within this time
+# a new attempt at a reported line ends if the line is not assigned to this gateway within this time
 TRIAL_NS = 60 * SECOND
 MOST_BYTES = 8_000  # limit, in bytes, of the names of reported lines in a lease record
 

@@ -230,7 +230,7 @@ async def read_after(path: ServerPath, place: int, messages: int, size: int) -> 
 
 
 class SampleGet(DirectGet):
-    """The messages in the answer to one direct get, parsed from raw headers.
+    """Collects the stored messages that answer one read request, parsed from raw headers.
 
     A sender may write any headers into a message, and the server appends its own headers. A parser that stops
     at an invalid header would miss the server's headers, and take the sender's claim for the message's

@@ -14,7 +14,7 @@ _NAME = re.compile(r"[A-Za-z0-9_-]+")
 
 
 def checked_name(kind: str, name: str) -> str:
-    """Return this name. Raises ValueError if it cannot be one token of a NATS subject."""
+    """Return a name that can be one token of a NATS subject. Raises ValueError for any other name."""
     if not isinstance(name, str) or not is_name(name):
         suggestion = re.sub(r"[^A-Za-z0-9_-]+", "-", str(name)).strip("-") or f"{kind}-1"
         raise ValueError(
@@ -50,7 +50,7 @@ def command_subject(line: str) -> str:
 
 
 def do_subject(gateway: str, run: str) -> str:
-    """Return the subject for the tokens of offers that this process (`run`) of the gateway has made."""
+    """Return the subject on which senders confirm commands that this process (`run`) has offered."""
     return f"do.{gateway}.{run}"
 
 

@@ -54,7 +54,7 @@ async def set_up(paths: Sequence[ServerPath]) -> dict[str, Any]:
 
 
 async def open_all(paths: Sequence[ServerPath]) -> None:
-    """Connect all paths. Raises FleetError if no server answers, or if a server is too old."""
+    """Open all connections. Raises FleetError if no server answers, or if a server is too old."""
     results = await asyncio.gather(*(path.open() for path in paths), return_exceptions=True)
     failures = [result for result in results if isinstance(result, Exception)]
     too_old = [failure for failure in failures if isinstance(failure, TooOld)]
