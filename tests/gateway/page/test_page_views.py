@@ -33,12 +33,15 @@ def asked_width(questions: list[dict[str, list[str]]]) -> int:
     return int(questions[-1]["to"][0]) - int(questions[-1]["from"][0])
 
 
-def test_the_filter_finds_drives_by_name_state_and_family(opened: Opener) -> None:
+def test_the_filter_finds_drives_by_name_state_and_family(opened: Opener, gateway: FakeGateway) -> None:
+    gateway.drive_changes = {"booster-1": {"fault": "undervoltage (UV)"}}
     page = opened()
     shown = page.locator("tr.drive:visible")
     page.keyboard.press("/")
     page.keyboard.type("pump")
     until_met(page, lambda: shown.count() == 4)
+    page.get_by_label("Filter drives").fill("UV")
+    until_met(page, lambda: shown.locator("td.name").all_inner_texts() == ["booster-1"])
     page.get_by_label("Filter drives").fill("")
     page.get_by_role("button", name=re.compile("Fault, silent")).click()
     names = ["conveyor-2", "labeller", "booster-1"]

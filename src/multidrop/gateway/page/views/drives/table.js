@@ -164,7 +164,8 @@ function drawFilter() {
   for (const h of heads) {
     const isOpen = !h.fold || isFiltered || opened.has(h.line.name);
     for (const r of h.rows) {
-      const isMatch = SHOWN[show][1](state(r.name)) && `${r.text} ${r.word.textContent}`.includes(query);
+      const text = `${r.text} ${r.word.textContent.toLowerCase()}`;
+      const isMatch = SHOWN[show][1](state(r.name)) && text.includes(query);
       r.row.hidden = !isMatch || !(isOpen || isProblem(r) || r.name === chosen);
     }
     h.row.hidden = isFiltered && h.rows.every(r => r.row.hidden);
