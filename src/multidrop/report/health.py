@@ -216,23 +216,13 @@ class LineUse:
     time: Array  # times of the exchanges, ns UTC
     needed: Array  # s for request, delay, reply and silence; at most the measured time
     asked: Mapping[str, int]  # number of answered exchanges, by drive
-    values: int  # number of values in the replies
     seconds: float
+    # time in s to read each register once; None if there are no values, or if a register has its own rate
+    cycle: float | None
 
     @property
     def utilisation(self) -> float:
         return float(self.needed.sum()) / self.seconds
-
-    @property
-    def cycle(self) -> float | None:
-        """The time in s to read each register once.
-
-        None if there are no values, or if a register has its own rate.
-        """
-        blocks = [block for drive in self.planned["drives"].values() for block in drive["blocks"]]
-        if any(block["every_ms"] is not None for block in blocks) or not self.values:
-            return None
-        return self.seconds * sum(len(block["registers"]) for block in blocks) / self.values
 
     def rate(self, drive: str) -> float:
         return self.asked.get(drive, 0) / self.seconds
@@ -288,7 +278,11 @@ def _line_use(recording: Recording, line: str, planned: Mapping[str, Any]) -> Li
         # measured time.
         needed[:-1] = np.minimum(needed[:-1], np.diff(time) / 1e9)
     end = float(needed[-1]) if len(time) else 0.0
-    return LineUse(line, planned, time, needed, asked, values, max(recording.seconds + end, 1e-9))
+    seconds = max(recording.seconds + end, 1e-9)
+    blocks = [block for drive in planned["drives"].values() for block in drive["blocks"]]
+    has_cycle = values and all(block["every_ms"] is None for block in blocks)
+    cycle = seconds * sum(len(block["registers"]) for block in blocks) / values if has_cycle else None
+    return LineUse(line, planned, time, needed, asked, seconds, cycle)
 
 
 def _exchanges(recording: Recording, name: str, drive: Mapping[str, Any]) -> tuple[Array, Array, int]:
