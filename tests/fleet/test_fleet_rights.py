@@ -287,10 +287,10 @@ def test_a_request_counts_as_unsent_only_if_this_request_was_denied() -> None:
     before = denials.of_request("stop.Line-1")
     denials.check_request("stop.Line-1", "_INBOX", before)
     asyncio.run(denials.note(denied))
-    with pytest.raises(MayNotSend, match=r"these credentials do not allow to publish to stop\.Line-1"):
+    with pytest.raises(MayNotSend, match=r"these credentials do not allow publishing to stop\.Line-1"):
         denials.check_request("stop.Line-1", "_INBOX", before)
     asyncio.run(denials.note(Exception('nats: permissions violation for subscription to "_inbox.x.*"')))
-    with pytest.raises(NoRight, match=r"do not allow to listen to _inbox\.x"):
+    with pytest.raises(NoRight, match=r"do not allow listening to _inbox\.x"):
         denials.check_request("stop.line-2", "_INBOX", 0)
 
 

@@ -136,4 +136,4 @@ class Denials:
 
 
 def _sentence(kind: str, subject: str) -> str:
-    return f"these credentials do not allow to {'publish' if kind == 'publish' else 'listen'} to {subject}"
+    return f"these credentials do not allow {'publishing' if kind == 'publish' else 'listening'} to {subject}"

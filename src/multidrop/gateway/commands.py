@@ -61,10 +61,10 @@ class UnknownDrive(ValueError):
 
 
 class VerbRule(NamedTuple):
-    """The role that a verb needs, and whether `verbs` of [serve.may] must list the verb."""
+    """The role that a verb needs."""
 
     role: Right
-    is_listed: bool
+    is_listed: bool  # True if the plant file must list the verb: the key `verbs` of [serve.may]
 
 
 VERBS: Mapping[str, VerbRule] = {

@@ -365,7 +365,7 @@ def test_a_commander_may_command_and_a_viewer_may_not(servers: SecuredCluster, t
                     told = await asker.write("pump", "frequency", 20.0)
                     assert told.outcome is outcome, told.text
                     if outcome is CommandOutcome.NOT_SENT:
-                        assert f"do not allow to publish to cmd.{LINE}" in told.text
+                        assert f"do not allow publishing to cmd.{LINE}" in told.text
                         assert made.writes == []
                     stopped = await asker.stop()
                     assert stopped.ok == told.ok, stopped.text

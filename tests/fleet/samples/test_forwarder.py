@@ -348,7 +348,7 @@ def test_insufficient_rights_are_reported_in_one_sentence(tmp_path: Path) -> Non
             async with samples_path(servers.urls, right) as path:
                 await create_stream(path, replicas=1)
                 assert await publish(path, subject_of("gateway-2", "b"), b"", {}) == 1
-                with pytest.raises(NoRight, match=r"do not allow to publish to samples\.gateway-1"):
+                with pytest.raises(NoRight, match=r"do not allow publishing to samples\.gateway-1"):
                     await publish(path, subject_of("gateway-1", "b"), b"", {})
 
         asyncio.run(live())

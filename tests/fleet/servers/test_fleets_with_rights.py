@@ -28,7 +28,7 @@ from multidrop.fleet.servers.connections import paths_of
 
 pytestmark = [pytest.mark.slow, pytest.mark.long]
 
-NOT_SENT = "the stop of drive-line-0 was NOT sent: these credentials do not allow to publish to stop.line-0"
+NOT_SENT = "the stop of drive-line-0 was NOT sent: these credentials do not allow publishing to stop.line-0"
 AN_HOUR_AHEAD = """
 import time
 seconds, ns = time.time, time.time_ns

@@ -83,13 +83,13 @@ def test_a_route_to_a_silent_server_is_dropped_soon(tmp_path: Path) -> None:
         until(lambda: routes(one) > 0, "there are routes again")
 
 
-NO_RIGHT = "these credentials do not allow to "
+NO_RIGHT = "these credentials do not allow "
 NOT_THEIRS = [
-    ("viewer", ["fleet", "init"], NO_RIGHT + "publish to $JS.API.STREAM.INFO.KV_contest"),
-    ("hub", ["fleet", "status"], NO_RIGHT + "publish to $JS.API.STREAM.INFO.KV_lease_0"),
-    ("viewer", ["fleet", "drain", "gw-a"], NO_RIGHT + "publish to gateway.gw-a.drain"),
-    ("gw-a", ["fleet", "serve", "gw-b"], NO_RIGHT + "listen to gateway.gw-b.*"),
-    ("viewer", ["hub", "--once"], NO_RIGHT + "publish to $JS.API.STREAM.INFO"),
+    ("viewer", ["fleet", "init"], NO_RIGHT + "publishing to $JS.API.STREAM.INFO.KV_contest"),
+    ("hub", ["fleet", "status"], NO_RIGHT + "publishing to $JS.API.STREAM.INFO.KV_lease_0"),
+    ("viewer", ["fleet", "drain", "gw-a"], NO_RIGHT + "publishing to gateway.gw-a.drain"),
+    ("gw-a", ["fleet", "serve", "gw-b"], NO_RIGHT + "listening to gateway.gw-b.*"),
+    ("viewer", ["hub", "--once"], NO_RIGHT + "publishing to $JS.API.STREAM.INFO"),
 ]
 
 

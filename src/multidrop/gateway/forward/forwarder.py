@@ -185,7 +185,7 @@ class RowForwarder(RetryingSender):
         self._spool = spool
         self._receiver = receiver
         self._earlier = state.newest  # number of the newest message of earlier runs
-        # assumed until `_ask` has asked the receiver
+        # until the receiver is asked: assume that it has none of the stored messages
         self._position = SpoolPosition(max(0, state.oldest - 1))
         self._is_asked = False
         self._accepted = 0  # messages sent since the gateway's start

@@ -28,9 +28,7 @@ FIRST_S = 10.0
 # time limit, in s, from an answer to the next complete request. uvicorn closes a silent connection after 30 s
 # already.
 AGAIN_S = 40.0
-# in s: a new connection without a request counts as fresh for this long; idle and busy connections are closed
-# before fresh ones
-FRESH_S = 1.0
+FRESH_S = 1.0  # in s: a connection without a request counts as fresh (see Rank) for this long
 MOST_FRESH = 64  # limit of fresh connections: above it, the oldest fresh connection is closed first
 STALLED_S = 10.0  # in s: a client that reads none of its answers for this long is disconnected
 
@@ -39,9 +37,7 @@ ENDS = "the gateway is shutting down: the outcome of this request is unknown"
 BODY_HEADERS = (b"content-length", b"transfer-encoding")
 # paths of stop requests; a request to VERB_PATH may be a stop too, depending on its body
 STOP_PATHS, VERB_PATH = ("/api/stop", "/api/fleet/stop"), "/api/act"
-# limit of connections that the operating system holds until the gateway accepts them; it accepts them even if
-# MOST_OPEN are open
-BACKLOG = 64
+BACKLOG = 64  # limit of new connections that the operating system holds until the gateway accepts them
 _WHY = {
     errno.EADDRINUSE: "another program listens there",
     errno.EACCES: "this user has no permission",

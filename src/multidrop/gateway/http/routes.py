@@ -249,7 +249,7 @@ class Pages(PageFiles):
     async def modbus_map(self, request: Request) -> Response:
         part: Any = self._gateway.feeds.get("modbus")
         if part is None:
-            return _error(404, "this gateway is no Modbus server; add [serve.modbus] to the plant file")
+            return _error(404, "this gateway is not a Modbus server; add [serve.modbus] to the plant file")
         kind = request.query_params.get("format", "json")
         if kind not in ("json", "csv"):
             raise Denied(400, f"format = {kind[:20]!r} is neither json nor csv")

@@ -27,9 +27,8 @@ REST_S = 0.1  # pause before each read of an identity check, which leaves time f
 
 MOST_READS = 2  # limit of drives whose parameters are read concurrently
 PARAMETERS_S = 3600.0  # time limit, in s, of reading all parameters of a drive
-# pause after a block of parameters: this many times the duration of the block's read, but not longer than the
-# second number in s
-PARAMETER_SHARE, MOST_PAUSE_S = 3, 1.0
+PARAMETER_SHARE = 3  # the pause after a block of parameters is this many times the duration of its read
+MOST_PAUSE_S = 1.0  # limit of that pause, in s
 
 # by register: its value or None, the time of the read (UTC, ms), "ok" or the reason of the failure
 ReadValues = dict[str, list[Any]]

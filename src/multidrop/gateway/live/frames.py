@@ -23,7 +23,7 @@ from multidrop.gateway.live.hub import Hub, KeptRow
 from multidrop.gateway.live.recent_statistics import RecentStatistics
 
 LEAST_S = 0.2  # shortest mean time, in s, between two frames
-EARLY_S = 0.02  # in s: if a frame was late, the next one may follow up to this much before LEAST_S has passed
+EARLY_S = 0.02  # in s: after a late frame, the next one may be early by at most this time
 WAIT_S = 20.0  # longest wait, in s, of a request for a frame
 MOST_VIEWERS = 200  # limit of concurrently waiting viewers
 WHOLE = -1  # frame number in the request of a viewer that has no frame yet

@@ -37,7 +37,7 @@ BURST_S = 0.2  # limit, in s, of unused line time that is saved for later reques
 MOST_WAITING = 8  # limit of the requests that wait for one line
 EXPIRY_S = 1.0  # in s: a request that has waited for this long is dropped
 CLOSED = "the gateway is shutting down, or has read its plant file again"
-# in s: writes are refused for this long after a standstill of the gateway, until all old requests are read
+# in s: after a standstill of the gateway, writes are refused for this long, because they may be old
 SETTLE_S = 1.0
 # in s: how long the answer to a stop waits for the motor; less than the usual timeout of clients
 STOP_WAIT_S = 0.4

@@ -117,7 +117,10 @@ class ModbusServer:
     # ---- requests ----
 
     def serve(self, port: str, request: MbapRequest, client: ModbusClient) -> Answer:
-        """Return the answer to a request, or an awaitable of it; None for a broadcast: it is not allowed."""
+        """Return the answer to a request, or an awaitable of it.
+
+        None, for a broadcast, closes the connection.
+        """
         if request.unit == 0:
             return None
         unit = self._units.find(port, request.unit)

@@ -1,4 +1,4 @@
-"""The table [serve.modbus] of a plant file, and its units: the drives as Modbus clients address them."""
+"""The table [serve.modbus] of a plant file, and the drives by the Modbus unit ids of its clients."""
 
 from __future__ import annotations
 

@@ -241,7 +241,7 @@ class Tool:
 
     def _give_up(self) -> None:
         if self._answering is not None and not self._answering.done():
-            # in the next round of the event loop, when the task has started
+            # soon: a task that is cancelled before it has started does not cancel the request it awaits
             self._loop.call_soon(self._answering.cancel)
         self._answering = None
 

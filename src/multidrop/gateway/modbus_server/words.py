@@ -325,7 +325,7 @@ def _float(value: float) -> bytes:
 
 
 def _units(register: Register[Any]) -> tuple[str | None, ...]:
-    """Return the units in which a register may be requested; None (any unit) is left out for raw counts."""
+    """Return the units in which the register may be requested; None means any unit, except for raw counts."""
     is_raw = register.values is None and register.step is None
     return (register.value_unit,) if is_raw else (register.value_unit, None)
 

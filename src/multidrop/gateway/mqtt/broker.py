@@ -24,7 +24,7 @@ RETRY_S = (1, 30)  # in s: the first and the longest pause before reconnecting
 KEEP_ALIVE_S = 15
 FAREWELL_S = 1.0  # time limit, in s, for sending the last messages before a disconnect
 CONFIRM_S = 10.0  # time limit, in s, for the broker's confirmation of messages
-CONFIRMED = "multidrop/confirmed"  # a topic to which this client never subscribes; see `Broker.confirm`
+CONFIRMED = "multidrop/confirmed"  # `confirm` unsubscribes from this topic, which has no subscription
 _log = logging.getLogger("multidrop.gateway.mqtt.part")
 
 

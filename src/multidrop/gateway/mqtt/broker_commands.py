@@ -53,7 +53,7 @@ class BrokerCommands:
         self._begin(self._do(drive, verb, caller, self._commands.act(drive, verb, options, caller)))
 
     def write(self, drive: str, register: str, value: float, time_ms: int, given_id: object = None) -> None:
-        """Write a register if the rules in this module's docstring allow it; else report why not.
+        """Write a register, or report why the command is refused, for example because it is too old.
 
         Raises ValueError for an invalid id.
         """
@@ -65,7 +65,7 @@ class BrokerCommands:
     def act(
         self, drive: str, verb: str, options: Mapping[str, object], time_ms: int, given_id: object = None
     ) -> None:
-        """Carry out a verb if the rules in this module's docstring allow it; else report why not.
+        """Carry out a verb, or report why the command is refused, for example because it is too old.
 
         Raises ValueError for an invalid id.
         """
