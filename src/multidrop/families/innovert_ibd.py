@@ -335,7 +335,8 @@ class InnovertIBD(Drive):
         yield from self._stopped(look, limit)
 
     def _is_off(self) -> Script[bool]:
-        return not (yield from read(self.terminals)) & Terminals.M01
+        """Return True if the programmed outputs show neither a run nor a ramp."""
+        return not (yield from read(self.terminals)) & (Terminals.M01 | Terminals.M02 | Terminals.YABC)
 
     @property
     def _has_state(self) -> bool:

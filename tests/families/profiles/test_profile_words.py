@@ -56,8 +56,8 @@ def wire(model: str, status: Any, **says: Any) -> Wire:
     """Return a test wire with the drive. Its status does not change when it is commanded."""
     drive: Any = MAKE[model](1)
     drive.commanded = 40.0
-    kind = drive.status.values
-    said = [kind(one) for one in status] if isinstance(status, list) else kind(status)
+    decode = drive.status.decode
+    said = [decode(one) for one in status] if isinstance(status, list) else decode(status)
     return Wire(drive, {**FREE, "status": said, **says})
 
 
@@ -136,6 +136,35 @@ def test_jog_sends_the_control_word_of_its_direction() -> None:
     found = wire("invt-goodrive", [GD_STANDBY, GD_RUNS, GD_RUNS, 2])
     found.drive.jog(Direction.REVERSE)
     assert sent(found) == [DELTA + "00 04"]
+
+
+@table(
+    ("model", "status"),
+    [
+        ("abb-acs355", 0x0241),
+        ("delta-vfd-el", 0xA000),
+        ("invt-goodrive", 0),
+        ("invt-goodrive", 9),
+        ("powtran-pi130", 0),
+        ("delixi-e", 4),
+        ("optidrive-e3", 0x0080),
+        ("schneider-atv320", 0x0202),
+        ("yaskawa-a1000", 0),
+    ],
+)
+def test_start_is_refused_while_the_status_is_impossible(model: str, status: int) -> None:
+    found = wire(model, [status])
+    with pytest.raises(WriteForbidden, match=f"cannot be started: its status is {status:04X}H, and"):
+        found.drive.start()
+    assert sent(found) == []
+
+
+@pytest.mark.parametrize("model", ["delta-vfd-el", "invt-goodrive"])
+def test_jog_is_refused_while_the_status_is_impossible(model: str) -> None:
+    found = wire(model, [0xA000])
+    with pytest.raises(WriteForbidden, match="cannot be started: its status is A000H, and"):
+        found.drive.jog()
+    assert sent(found) == []
 
 
 @pytest.mark.parametrize(

@@ -209,8 +209,9 @@ class Profile(Drive):
 
     The verbs guarantee the same as those of the built-in families. A stop is always sent, repeated until it
     is confirmed, and observed until the drive is at rest. A start or a reset is written once. A start is
-    refused in a fault, in local control, and without a setpoint in force. A reset is refused while the motor
-    turns, never has a bit that runs it, and comes after a stop. `identify` only reads. A stop is withheld
+    refused in a fault, in local control, without a setpoint in force, and while the status is impossible in
+    this profile. A reset is refused while the motor turns, never has a bit that runs it, and comes after a
+    stop. `identify` only reads. A stop is withheld
     only if the status is impossible in this profile and neither 0 nor FFFFH, and another check fails too. A
     wrong `station` or `signature` alone is no proof of another family: these are settings, and may not be in
     force yet.
@@ -392,6 +393,10 @@ class Profile(Drive):
         """Raise WriteForbidden in a fault, in local control, or if the status prevents a start."""
         if (yield from self._tripped(status)):
             raise self._reset_first((yield from self._fault()))
+        if impossible := self._impossible(status):
+            raise WriteForbidden(
+                f"{self.name} cannot be started: its status is {status:04X}H, and {impossible}"
+            )
         if why := self._not_ready(status):
             raise WriteForbidden(f"{self.name} {why}; {self.remote}")
 
