@@ -24,7 +24,7 @@ STOPS = ("stop", "coast", "emergency-stop")
 HARD_WIRED = "use the hard-wired stop"  # advice to the user when a stop could not be sent
 _MISNAMED = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
 
-COMMANDS = {  # command name: (its module in this package, its help text)
+COMMANDS = {  # each command's module in this package, and its help text
     "demo": ("demo", "poll simulated drives on three lines, and run their motors"),
     "schema": ("schema", "print the JSON Schema of a plant file, for editors"),
     "models": ("models", "list the families, or one family's registers"),

@@ -119,7 +119,7 @@ class Monitor:
         self._at = Position()
         self._on_yes: Callable[[], None] | None = None  # called if the user answers the question with y
         self._stops: list[threading.Thread] = []  # threads that carry out stops
-        # line's name: number of stopped drives, number of all drives
+        # numbers of stopped drives and of all drives, by line name
         self._stop_results: dict[str, tuple[int, int]] = {}
         self._has_left = False
         self._side_reader = SideReader(session.poller)

@@ -29,14 +29,14 @@ from multidrop.families.registry import find_model
 from multidrop.params import NotWritten, ParameterSet, files
 from multidrop.params.values import check_same_model
 
-ACTIONS = {  # action: (its module in this package, or "" for this module; its help text)
+ACTIONS = {  # each action's module in this package ("" for this module), and its help text
     "save": ("", "read all parameters of a drive into a new TOML or CSV file"),
     "diff": ("", "compare files and drives; exit status 1 if they differ"),
     "apply": ("", "write a file's parameters to a stopped drive, if they differ"),
     "list": ("", "list the parameters of a drive or a model"),
 }
 _DRIVES = ("PORT MODEL ADDRESS", "PLANT.toml DRIVE")
-_WAYS = {  # action: its usage lines
+_WAYS = {  # usage lines, by action
     "save": [f"{drive} FILE" for drive in _DRIVES],
     "diff": [
         *(f"FILE {drive}" for drive in _DRIVES),

@@ -47,7 +47,7 @@ from multidrop.errors import LineError, Unsupported
 from multidrop.plant.model import Plant, PlantLine
 
 _DIRECTED = ("start", "jog")
-_FURTHER = {"set-frequency": ("HZ",)}  # command: the words that follow the drive's name
+_FURTHER = {"set-frequency": ("HZ",)}  # words that follow the drive's name, by command
 _SHOWING_WATCHDOG = ("state", *_DIRECTED)  # commands that print how the motor reacts if this program dies
 _QUESTIONS = {  # questions asked before the first request of a verb; stops need no confirmation
     "start": "Start the motor of",

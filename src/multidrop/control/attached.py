@@ -33,7 +33,8 @@ def made(drive: D | type[D], address: int | None, line: dict[str, Any], details:
     """Return `drive`, or, if it is a family, a new drive of that family.
 
     `line` and `details` are options of the new drive; `details` override `line`. Raises TypeError if `drive`
-    is neither a family nor a drive, if the address is missing, or if details are given for an existing drive.
+    is neither a class of drives nor a drive, if the address is missing, or if details are given for an
+    existing drive.
     """
     family = drive if isinstance(drive, type) else type(drive)
     if not issubclass(family, Drive):
@@ -48,7 +49,7 @@ def made(drive: D | type[D], address: int | None, line: dict[str, Any], details:
 
 
 class BusLink:
-    """Carries out the reads, writes, moves and stops that are requested by methods of a bus's drives."""
+    """Carries out the reads, writes and stops that the methods of a bus's drives request."""
 
     def __init__(self, exchanges: Exchanges, performer: Performer, stopper: Stopper) -> None:
         self._exchanges = exchanges
@@ -177,7 +178,7 @@ class Leaving:
         self._stopper = stopper
         self._stop_all = stop_all
         self._last_act: LastAct | None = None
-        # by drive name: the results of the stops that `stop_on_exit` has caused
+        # results of the stops at exit, by drive name
         self.found: Mapping[str, Stopped] = {}
 
     @property
@@ -200,16 +201,16 @@ class Leaving:
         _warn_of(self.found)
 
     def begin(self) -> None:
-        """Cancel all calls on the bus.
+        """Cancel all calls on the bus; start to stop the drives if `stop_on_exit` was called.
 
-        If `stop_on_exit` was called, also start to stop the drives, without waiting for the end of the stops.
+        Does not wait for the end of the stops.
         """
         self._latches.shut()
         if self._last_act is not None:
             self._last_act.begin()
 
     def finish(self) -> None:
-        """Cancel all calls and start the stops as `begin` does; then wait for all unfinished stops."""
+        """Cancel all calls, stop the drives if `stop_on_exit` was called, and wait for all stops."""
         self.begin()
         if self._last_act is not None:
             exit_hook().finish(self._last_act)

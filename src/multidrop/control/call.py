@@ -35,7 +35,7 @@ class Latches:
         self._exchanges = exchanges
         self._latches: dict[Drive, Latch] = {}
         self.is_shut = False
-        # by unfinished stop: the identifier of the thread that called it, and the drives to stop
+        # for each unfinished stop: the identifier of the thread that called it, and the drives to stop
         self._stops: dict[object, tuple[int, frozenset[Drive]]] = {}
 
     def forked(self) -> None:
@@ -111,13 +111,13 @@ class Latches:
 # ---- calls ----
 
 
-MOST_CHARACTERS = 64  # length in characters of the longest request for one register and its reply together
+MOST_CHARACTERS = 64  # number of characters of the longest request for one register, plus its reply
 
 _log = logging.getLogger("multidrop.control")
 
 
 class Call:
-    """One call of the verb `verb`, or of a plain write (`verb` is then empty).
+    """One call of a method that writes to a drive. `verb` is its name, such as "start"; "" for a plain write.
 
     The call sends no write after a stop was called, or when the call is late by more than `expiry` seconds.
     Lateness is the time since the call, minus the time allowed for the call's own reads, writes and waits. So
@@ -140,14 +140,14 @@ class Call:
         self._limit_ns = limit_ns
 
     def restarted(self) -> Call:
-        """Return a copy of this call. The copy starts now, but a stop since the original call cancels it."""
+        """Return a copy that starts now. A stop since the original call cancels the copy too."""
         return Call(self.drive, self.permit, self.expiry, self.verb, self._limit_ns)
 
     @property
     def expires_ns(self) -> int:
-        """The CLOCK_BOOTTIME in ns after which the next write is not sent.
+        """The time after which the next write is not sent, in ns of CLOCK_BOOTTIME.
 
-        The time includes the interval that the drive needs between two requests.
+        This time includes the interval that the drive needs between two requests.
         """
         expires_ns = self._due_ns + round((self.expiry + self.drive.least_interval) * 1e9)
         return expires_ns if self.sent else int(min(expires_ns, self._limit_ns))

@@ -99,7 +99,7 @@ def stop_drive_by(verb: str, drive: Drive, seconds: float | None) -> Results:
 
 
 def stop_line(bus: Callable[[], Any], names: Sequence[str], seconds: float | None) -> Results:
-    """Stop all drives on the bus that `bus` returns; return the results of the drives `names`, by name."""
+    """Stop all drives on the bus that `bus()` returns; return the results of the drives in `names`."""
     try:
         found: Mapping[str, Stopped] = bus().stop_all(seconds=seconds)
     except Exception as failure:  # any failure: the results of all drives report it
@@ -216,10 +216,10 @@ class RepeatedStops:
     ) -> None:
         self._stop = stop
         self._begin = begin
-        # by drive: the newest repeated stop, and the time of that stop's call
+        # each drive's newest repeated stop, and when that stop was called
         self._repeated: dict[Drive, tuple[StopFuture, float]] = {}
-        self._sent: dict[Drive, StopFuture] = {}  # by drive: the single stop that is in flight
-        # by drive: the single stop to send after the one in flight
+        self._sent: dict[Drive, StopFuture] = {}  # each drive's single stop that is in flight
+        # each drive's single stop that will be sent after the one in flight
         self._waiting: dict[Drive, StopFuture] = {}
         self._tasks: set[StopFuture] = set()
 

@@ -42,7 +42,7 @@ class LedgerCell:
 
 @dataclass(frozen=True)
 class Wear:
-    """The number of writes to one register of one drive (a cell)."""
+    """How often one register of one drive was written."""
 
     cell: LedgerCell
     writes: int  # all writes so far
@@ -112,7 +112,7 @@ class Ledger:
             ledger.commit()
 
     def wear(self, now: float) -> list[Wear]:
-        """Return the wear of every cell ever written, sorted by writes in the last year, most first."""
+        """Return the number of writes of each register, the most written within the last year first."""
         if not self.path.exists():
             return []
         with self._opened() as ledger:

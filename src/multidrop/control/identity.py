@@ -63,8 +63,8 @@ class EchoCheck:
     def probe(self, drive: Drive, *, insists: bool = False) -> None:
         """Read a register once, so that the line learns whether a received copy of a request was an echo.
 
-        If another client sends the same request, that request looks like our echo. Without this read, the
-        line would from then on ignore the drive's confirmations of writes, which are copies of requests too.
+        A request that another client sends may look like our echo. Without this read, later confirmations of
+        writes, which are copies of their requests, would be ignored as echoes.
         """
         with suppress(*READ_FAILURES):
             self.read_any(drive, 1, insists=insists, timeout=WRITE_TIMEOUT)
@@ -107,7 +107,7 @@ class _Findings:
         self.confirmed: _Confirmed | None = None
         self.stops: set[float] = set()  # raw counts that `check_before_stop` has allowed
         self.suspicion: Suspicion | None = None  # the suspicion of the previous check before a stop
-        self.doubt = ""  # why the drive may be of another family, although it was sent a stop
+        self.doubt = ""  # the suspicion in spite of which a stop was sent
 
 
 class IdentityCheck:
@@ -233,7 +233,7 @@ class IdentityCheck:
         rivals = run_by(register, count)
         suspicion = self._suspicion(drive, rivals) if self._is_in_step(drive) else None
         before, findings.suspicion = findings.suspicion, None
-        # the registers have shown SURE times that the drive is of the make `suspicion.make`
+        # `make` is set only if the registers showed this make SURE times
         if suspicion is not None and suspicion.make is not None:
             raise _withheld(drive, suspicion.why, suspicion.make)
         if suspicion is not None and before is None:
@@ -251,19 +251,19 @@ class IdentityCheck:
         findings.stops.add(count)
 
     def doubt(self, drive: Drive) -> str:
-        """Return why a drive may be of another family although it was sent a stop; "" without a suspicion."""
+        """Return the suspicion in spite of which a stop was sent to the drive; "" if there was none."""
         findings = self._findings(drive)
         return "" if findings.confirmed else findings.doubt
 
     def _is_in_step(self, drive: Drive) -> bool:
-        """Return True if a late reply to an earlier request cannot be taken for the present reply."""
+        """Return True if the drive has answered all requests in time since its port was opened."""
         peer = self._exchanges.peers.of(drive)
         return not (peer.counters().late or peer.silences or peer.late_until_ns)
 
     def _suspicion(self, drive: Drive, rivals: Sequence[Make]) -> Suspicion | None:
         """Run the family's `identify` once; return a suspicion if the drive seems to be of another family.
 
-        Registers that show a make in `rivals` are read only if the family's identity is weak.
+        The registers of the makes in `rivals` are read only if the family's identity is weak.
         """
         findings, silences = self._findings(drive), self._exchanges.peers.of(drive).silences
         refused = None
@@ -303,7 +303,7 @@ class IdentityCheck:
         return None if make is None else Suspicion(_declare(make), make=make)
 
     def _shown(self, drive: Drive, makes: Iterable[Make], timed: Timed = nullcontext) -> Make | None:
-        """Return the first of these makes that the drive's registers show SURE times; None if there is none.
+        """Return the first of these makes that the drive's registers show SURE times, or None.
 
         After a request without a reply, only makes that may leave a request unanswered are still tried.
         """
@@ -335,9 +335,10 @@ class IdentityCheck:
                 return
 
     def _lookalike(self, drive: Drive, register: Register[Any], count: float) -> Drive | None:
-        """Return the drive as an object of a built-in family that recognises it SURE times; None without one.
+        """Return the drive as an object of another built-in family that recognises it, or None.
 
-        Families in which the same raw count at this register is also a stop are skipped.
+        The other family must recognise it SURE times. Families in which the same raw count at this register
+        is also a stop are skipped.
         """
         settings = drive.settings
         for family in MODELS.values():
@@ -360,7 +361,7 @@ class IdentityCheck:
             return False
 
     def _reads_as(self, other: Drive, drive: Drive, script: Script[Any], timed: Timed = nullcontext) -> Any:
-        """Read `drive` by a script of the drive `other`; return the script's result, or False if it fails.
+        """Run a script of `other` on `drive`; return its result, or False if a read fails.
 
         Raises NoReply if the drive does not answer.
         """

@@ -32,7 +32,7 @@ class _Over(Exception):
 
 
 class Performer:
-    """Carries out the scripts of verbs on one bus.
+    """Carries out writes, and verbs such as `start`, on the drives of one bus.
 
     A write expires if it cannot be sent within `expiry` seconds of its call.
     """
@@ -47,7 +47,7 @@ class Performer:
         self._expiry = expiry
 
     def call(self, drive: Drive, verb: str = "", seen: int | None = None) -> Call:
-        """Return a new call, whose expiry starts now, and which any later stop of the drive cancels.
+        """Return a new call. It expires, and any later stop of the drive cancels it.
 
         For a call that started earlier, `seen` is the drive's number of stops at that time.
         """
@@ -228,7 +228,7 @@ class Broadcaster:
     def write(
         self, drives: Sequence[Drive], register: Register[Any] | str, value: Any
     ) -> dict[str, State | BusError]:
-        """Broadcast a write; return by drive name the state read afterwards, or the error of that read.
+        """Broadcast a write; return each drive's state afterwards, or the error of reading it.
 
         Raises WriteForbidden if the write must not be broadcast.
         """

@@ -251,7 +251,7 @@ class WriteRecords:
     def log_later(
         self, drive: Drive, request: Message, what: str, effect: Effect, why: str = "", held: Any = None
     ) -> None:
-        """Queue the audit record until `catch_up` or `catch_up_aside`; log the write on the log thread."""
+        """Queue the audit record, and log the write on the log thread."""
         self._put(self._record(drive, request, what, effect.value, why, held), partial(log_aside, _log))
 
     def note_called(self, drive: Drive, request: Message, what: str) -> None:

@@ -47,7 +47,7 @@ def raw_count(drive: Drive, register: Register[T], value: T) -> float:
 
 
 def check_known(drive: Drive, register: Register[Any], raw: float) -> None:
-    """Raise WriteForbidden if the owner must first confirm the drive's class, and this may command the motor.
+    """Raise WriteForbidden if this may command the motor and the owner has not confirmed the drive's class.
 
     A stop needs no confirmation. If the class is from a family file, all other raw counts need the owner's
     confirmation, even harmless ones.
@@ -91,7 +91,7 @@ def _has(drive: Drive, name: str) -> bool:
 
 
 def check_broadcast(drive: Drive, register: Register[Any], raw: float) -> None:
-    """Raise WriteForbidden if the owner must first confirm the drive's class, unless this is a stop."""
+    """Raise WriteForbidden if this is not a stop and the owner has not confirmed the drive's class."""
     if not is_stop(drive, register, raw):
         drive.check_confirmed(register.name)
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from decimal import Decimal
 from functools import partial
-from math import inf
+from math import inf, nan
 from numbers import Real
 from typing import Any
 
@@ -43,7 +43,7 @@ PAUSE_S = 0.2  # s; pause before a stop is repeated
 AT_ONCE = 8  # after this many steps without a good reply, a stop shares the line with polling
 # after a stop's step without a good reply, polling has the line for this multiple of the step's duration
 SHARE = 1.5
-MOST_STEPS = 8  # limit of the steps of its script if a stop is sent again after an interruption
+MOST_STEPS = 8  # limit of a script's steps if an interrupted stop is sent once more
 UNSENT = (WriteForbidden, LineError, NotMaster, ValueError)
 WORTH_REPEATING = (Unconfirmed, NotVerified, NoReply, BadReply, DriveException, PortLost, NotMaster)
 UNANSWERED = (Unconfirmed, NoReply, BadReply)
@@ -316,7 +316,7 @@ class StopAttempt:
 
 
 def _noting_return(make: Callable[[], Script[Any]], returned: list[bool]) -> Script[None]:
-    """Carry out a script, and append to `returned` if it ended by itself, not by a signal or MemoryError."""
+    """Carry out a script. Append to `returned` if no signal or MemoryError ended the script."""
     yield from make()
     returned.append(True)
 
@@ -511,20 +511,21 @@ def _now() -> float:
 
 
 def _limit(seconds: float | None) -> float | None:
-    """Return a stop's time limit as a float: a Decimal, for example, cannot be added to a float.
+    """Return a stop's time limit as a float; None, with a warning, if it is invalid.
 
-    An invalid limit does not prevent the stop: log a warning and return None, which means no limit.
+    None does not limit the stop, so an invalid limit does not prevent it.
     """
     if seconds is None:
         return None
     if isinstance(seconds, (Real, Decimal)) and not isinstance(seconds, bool):
-        with suppress(ValueError):  # raised for Decimal("sNaN")
-            try:
-                limit = float(seconds)
-            except OverflowError:
-                limit = inf if seconds > 0 else -inf
-            if limit >= 0:
-                return limit
+        try:
+            limit = float(seconds)  # a Decimal cannot be added to a float
+        except OverflowError:
+            limit = inf if seconds > 0 else -inf
+        except ValueError:
+            limit = nan  # Decimal("sNaN")
+        if limit >= 0:
+            return limit
     sentence = (
         "seconds = %.100r is not a time for a stop: the stop is repeated for at least %g s, as without this "
         "argument"
@@ -538,7 +539,6 @@ def stop_together(stops: Sequence[StopAttempt], do: Do, end: Callable[[StopAttem
     waiting = [stop for stop in stops if not stop.is_over]
     while waiting:
         stop = min(waiting, key=_due)  # the stop that is due first
-
         clock.sleep(max(0.0, stop.due - _now()))
         waiting.remove(stop)
         if stop.advance(do, _now):

@@ -104,7 +104,10 @@ class Decoder:
 
     @property
     def asked(self) -> tuple[Framing, Message]:
-        """The framing and content of the request for which `decode` returned UNKNOWN; answer by `know`."""
+        """The framing and content of the request at which `decode` stopped with UNKNOWN.
+
+        Call `know` with its layout, then `decode` again.
+        """
         return Framing(self._c.span.framing), from_c(self._c.span.message)
 
     def know(self, block: RowLayout | None) -> bool:

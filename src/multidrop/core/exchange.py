@@ -280,7 +280,7 @@ class Peer:
         lib.md_late_inherit(self.c, before.c)
 
     def prove_by(self, proofs: Sequence[Exchange]) -> None:
-        """Set the proofs. A proof is a read whose reply shows that no earlier reply can still come.
+        """Set the proofs: reads whose replies show that no reply to an earlier request can still come.
 
         If a late reply could be mistaken for a new one, the core sends a proof first. Only the first
         MOST_PROOFS are used; their replies must all differ. Call this once, before the first exchange: from

@@ -162,7 +162,7 @@ class _Engine:
 
     @property
     def c(self) -> Any:
-        """The core's struct md_engine. Raises OSError if its thread cannot be started."""
+        """The core's engine (struct md_engine). Raises OSError if the core's thread cannot be started."""
         with self._starting:
             if self._c is None:
                 started = lib.md_engine_start()

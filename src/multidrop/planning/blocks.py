@@ -165,9 +165,11 @@ class _Neighbours:
 
     carrier: Carrier
     registers: tuple[Register[Any], ...]
-    spans: tuple[tuple[int, int], ...]  # by register: its first address, and the address after its last one
-    joined: tuple[bool, ...]  # by register: True if one request may read it together with the next register
-    tied: tuple[bool, ...]  # by register: True if one request must read it together with the next register
+    spans: tuple[tuple[int, int], ...]  # each register's first address, and the address after its last one
+    # for each register: True if one request may read it together with the next register
+    joined: tuple[bool, ...]
+    # for each register: True if one request must read it together with the next register
+    tied: tuple[bool, ...]
     limit: int  # limit of addresses in a request; a register with more addresses is still read whole
 
     def ending_at(self, end: int) -> Iterator[tuple[int, int]]:
@@ -241,9 +243,9 @@ def _ways(framing: Framing, neighbours: _Neighbours) -> tuple[_Way, ...]:
     With a long delay, few requests are quicker; with a short delay, few characters. The algorithm is dynamic
     programming over the first register of the last request.
     """
-    fronts: list[list[_Way]] = [[_Way(0, ())]]  # the item n has the ways to divide the first n registers
+    fronts: list[list[_Way]] = [[_Way(0, ())]]  # item n: the ways to divide the first n registers
     for end in range(1, len(neighbours.registers) + 1):
-        fewest: dict[int, _Way] = {}  # by number of requests: the way with the fewest characters
+        fewest: dict[int, _Way] = {}  # the division with the fewest characters, by number of requests
         for begin, count in neighbours.ending_at(end):
             own = characters(framing, neighbours.carrier, count)
             for before in fronts[begin]:

@@ -210,7 +210,7 @@ class Schedule(Generic[J]):
         self._health: dict[int, Health] = self.back_off.health
         self._waiting: list[tuple[int, int, J]] = []  # heap of (start of the slot, number, job)
         self._begun: list[J] = []  # jobs whose slot has started but is not carried out yet
-        self._ready: dict[int, int] = {}  # by drive that needs pauses: the earliest time of its next request
+        self._ready: dict[int, int] = {}  # earliest time of the next request to each drive that needs pauses
         self._held: list[J] = []  # jobs without a period that must wait until their drive's pause has ended
         self._round: list[J] = []  # jobs without a period, in the order of their turns
         self._next = 0  # index in `_round` of the next job

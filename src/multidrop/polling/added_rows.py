@@ -70,7 +70,8 @@ class AddedRows:
         self._names = names
         self._lock = threading.RLock()  # reentrant: a signal handler may close the poller during `take`
         self._channels = ChannelSet(())
-        self._codes: dict[int, tuple[int, int]] = {}  # by input slot: the codes of its drive and register
+        # the codes of the drive and the register of each input slot
+        self._codes: dict[int, tuple[int, int]] = {}
         # by the codes of a drive and a register: the input slot; only for registers that channels use
         self._slots: dict[tuple[int, int], int] = {}
         # the newest drive of each name; weak: a drive that was removed must not stay in memory
@@ -190,7 +191,7 @@ class AddedRows:
         return added
 
     def _rows_of_present_drives(self, batch: Batch) -> Iterator[SlotRow]:
-        """Yield the rows that channels are computed from, but no rows of drives that have been replaced."""
+        """Yield the rows from which channels are computed, without rows of replaced drives."""
         rows = slot_rows(batch.columns(), self._slots)
         since_ns = self._slot_since_ns
         return (row for row in rows if row.monotonic_ns >= since_ns.get(row.slot, 0)) if since_ns else rows

@@ -118,10 +118,9 @@ MARGIN = 0.05
 
 
 class PolledLine:
-    """Polls one line: its bus, drives and schedule.
+    """Polls one line: its bus, drives and schedule. Any thread may add and remove drives.
 
-    `number` identifies the line when the core calls the poller's thread, which then calls `tend`. Any thread
-    may add and remove drives.
+    If the line needs attention, the core reports its `number` to the poller's thread, which calls `tend`.
     """
 
     def __init__(

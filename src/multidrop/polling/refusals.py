@@ -32,11 +32,13 @@ class Refusals:
     def __init__(self, schedule: Schedule[PolledJob], maker: JobMaker) -> None:
         self._schedule = schedule
         self._maker = maker
-        # by rare job in use: the normal job that it replaces
+        # the rare jobs in use, each with the normal job that it replaces
         self._set_aside: dict[PolledJob, PolledJob] = {}
-        self._rare: dict[PolledJob, PolledJob] = {}  # by normal job: the rare job that was made for it
-        self._wholes: dict[PolledJob, PolledJob] = {}  # by part of a split job: the whole job as planned
-        self._trials: dict[PolledJob, PolledJob] = {}  # by retry of a split job: the whole job as planned
+        self._rare: dict[PolledJob, PolledJob] = {}  # the rare job that was made for each normal job
+        # for each part of a split job: the whole job as planned
+        self._wholes: dict[PolledJob, PolledJob] = {}
+        # for each retry of a split job: the whole job as planned
+        self._trials: dict[PolledJob, PolledJob] = {}
         self._probes: dict[int, PolledJob] = {}  # single-register jobs, by drive address
 
     @property

@@ -390,7 +390,7 @@ class Exchanges:
         return completion if completion.count >= 0 else self._settled(drive, made, completion, expires_ns)
 
     def _check_held_back(self, drive: Drive, failure: PortLost) -> None:
-        """Raise NotMaster if the request was not sent and this process is not the line's master."""
+        """Raise NotMaster if the request was not sent because this process is not the line's master."""
         if not failure.is_sent and not self.line.may_send:
             raise NotMaster(drive.name, self.line.port) from None
 

@@ -90,10 +90,10 @@ class Peers:
         least = min(drive.response_timeout, documented)
         asked_as = type(drive), drive.framing, drive.settings, silence(drive), least, drive.response_timeout
         key = drive.address, *asked_as
-        # a known peer is kept, because the core may still use its proofs (see Peer.prove_by)
+        # never replaced: the core may still read the known peer's list of proofs
         if key not in self._known:
             self._known[key] = self._new(drive, least)
-        # A late reply of a removed drive could be mistaken for a reply of the next drive at its address.
+        # otherwise a late reply of a removed drive could be taken for the new drive's reply
         peer = self.present[drive] = self._known[key]
         for other, known in self._known.items():
             if other[0] == drive.address and known is not peer:

@@ -121,9 +121,10 @@ class PreparedRead:
 
 
 class ReadPlan:
-    """The reads that return the values of `wanted` (registers or their names), the last read first.
+    """The requests that read one list of registers, in reverse order.
 
-    `only` is the read that alone returns all of `wanted` in its order; None if there is no such read.
+    `wanted` are these registers or their names. `only` is the single request that returns them all in this
+    order, or None.
     """
 
     __slots__ = ("names", "only", "reads", "wanted")
@@ -165,7 +166,7 @@ class PreparedReads:
         self.of = of
         self.newest = NOTHING  # the plan that was used last; to use it again, no registers are hashed
         self.prepare = prepare
-        # by block that the drive does not answer as a whole: the smaller blocks to read instead
+        # for each block that the drive does not answer as a whole: the smaller blocks to read instead
         self.parts: dict[Block, tuple[Block, ...]] = {}
         # blocks that may be too long for the drive, but that it has answered
         self.answered: set[Block] = set()

@@ -3,7 +3,7 @@
 An action has the name of the similar command for a plant without a fleet, if there is one.
 """
 
-ACTIONS = {  # action: (its module in this package, its help text)
+ACTIONS = {  # each action's module in this package, and its help text
     "demo": ("demo", "kill a gateway of a simulated fleet and show the takeover"),
     "rights": ("setup", "write the servers' configuration, and a key for each user"),
     "init": ("setup", "set the NATS servers up, and store the plant"),

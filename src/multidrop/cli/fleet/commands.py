@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 _DIRECTIONS = ("forward", "reverse")
 _DIRECTED = ("start", "jog")
-# command: the words that follow the drive's name
+# words that follow the drive's name, by command
 _FURTHER = {"write": ("REGISTER", "VALUE"), "set-frequency": ("HZ",)}
 
 

@@ -23,7 +23,7 @@ from multidrop.errors import BusError
 from multidrop.families.registry import find_model
 from multidrop.plant.loader import load_plant
 
-LINES = {  # line name: (name, model, framing) of each of its drives
+LINES = {  # name, model and framing of each line's drives
     "pumps": (
         ("pump-1", "erman-er-g-220", "rtu"),
         ("pump-2", "erman-er-g-220", "rtu"),

@@ -52,9 +52,10 @@ class Triggering(NamedTuple):
 
     pre: float  # s before a trigger that are recorded
     post: float  # s after a trigger that are recorded
-    # trigger channel that is computed from a condition: the condition's text
+    # the text of the condition from which each trigger channel is computed
     conditions: Mapping[TriggerSeries, str]
-    signals: Mapping[str, Sequence[TriggerSeries]]  # condition's text: registers whose curves are drawn
+    # registers whose curves are drawn, by the condition's text
+    signals: Mapping[str, Sequence[TriggerSeries]]
 
 
 def _open(out: Path, metadata: Metadata, how: Rotation | Triggering | None) -> RecordingWriter:
@@ -134,8 +135,9 @@ class LiveDrive:
     polled: PolledDrive
     cycle: float = 0.0  # planned cycle time of the drive's line, in s
     line_utilisation: float = 1.0  # planned utilisation; at 1 and above, polling leaves no spare line time
-    newest: dict[str, Row] = field(default_factory=dict)  # register: its newest sample
-    missed: dict[str, Row] = field(default_factory=dict)  # register: its last miss, if newer than its sample
+    newest: dict[str, Row] = field(default_factory=dict)  # each register's newest sample
+    # each register's last miss, if newer than its newest sample
+    missed: dict[str, Row] = field(default_factory=dict)
     last_miss: str = ""  # status of the last miss whose request was sent
     so_far: Statistics = _NOTHING
     recent: Statistics = _NOTHING
