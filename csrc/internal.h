@@ -149,7 +149,7 @@ enum {
 
 void md_tap_put(struct md_tap *tap, int side, int64_t time_ns, const uint8_t *bytes, size_t len);
 
-/* ---- waiter_epoll.c, or waiter_poll.c on other systems: wait for many descriptors ---- */
+/* ---- waiter.c: wait for many descriptors ---- */
 
 struct md_waiter;
 

@@ -56,7 +56,7 @@ def test_utc_offset_is_read_for_each_batch_of_rows(build: Callable[..., None]) -
 def test_threads_can_open_and_close_ports_concurrently(
     build: Callable[..., None], sanitizers: list[str]
 ) -> None:
-    build("test_engine", *core_without("waiter_poll"), sanitizers=sanitizers)
+    build("test_engine", *core_without(), sanitizers=sanitizers)
 
 
 @pytest.mark.slow
@@ -64,19 +64,19 @@ def test_threads_can_open_and_close_ports_concurrently(
 def test_a_call_within_the_silence_after_an_exchange_does_not_wake_the_thread(
     build: Callable[..., None],
 ) -> None:
-    build("test_wakings", *core_without("waiter_poll", "wakeup"))
+    build("test_wakings", *core_without("wakeup"))
 
 
 @pytest.mark.slow
 @WAITS_BY_EPOLL
 def test_the_cores_thread_does_not_spin_while_a_caller_waits(build: Callable[..., None]) -> None:
-    build("test_spinning", *core_without("waiter_poll", "clock"))
+    build("test_spinning", *core_without("clock"))
 
 
 @pytest.mark.slow
 @WAITS_BY_EPOLL
 def test_an_exchange_of_a_steady_drive_reads_the_port_once(build: Callable[..., None]) -> None:
-    build("test_looks", *core_without("waiter_poll", "port"))
+    build("test_looks", *core_without("port"))
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="others have no RS-485 mode")
@@ -87,7 +87,7 @@ def test_a_transceiver_sends_until_the_last_bit_has_left(build: Callable[..., No
 @pytest.mark.slow
 @WAITS_BY_EPOLL
 def test_a_command_that_waits_too_long_for_rts_is_cancelled(build: Callable[..., None]) -> None:
-    build("test_stuck_rts", *core_without("waiter_poll"))
+    build("test_stuck_rts", *core_without())
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the driver is Linux's")
@@ -98,12 +98,12 @@ def test_a_baud_rate_without_an_integer_divisor_is_refused(build: Callable[..., 
 @WAITS_BY_EPOLL
 @pytest.mark.parametrize("program", ["test_waiter", "test_waiter_refused"])
 def test_waits_are_exact_to_the_nanosecond(build: Callable[..., None], program: str) -> None:
-    build(program, "waiter_epoll")
+    build(program, "waiter")
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="masterships are Linux's")
 def test_the_mastership_deadline_is_checked_before_each_write(build: Callable[..., None]) -> None:
-    build("test_mastership", *core_without("waiter_poll", "port", "rs485", "mastership"))
+    build("test_mastership", *core_without("port", "rs485", "mastership"))
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="realtime scheduling is limited by Linux's timers")

@@ -80,9 +80,7 @@ def core_names(tree: Path) -> list[str]:
     text = (tree / "csrc" / "CMakeLists.txt").read_text()
     (sources,) = re.findall(r"set\(SOURCES ([^)]+)\)", text)
     _windows, system = re.findall(r"set\(SYSTEM ([^)]+)\)", text)
-    return [
-        Path(part).stem for part in sources.replace("${SYSTEM}", system).replace("${WAITER}", "epoll").split()
-    ]
+    return [Path(part).stem for part in sources.replace("${SYSTEM}", system).split()]
 
 
 def _objects(tree: Path, directory: str, main: str) -> list[str]:
