@@ -606,11 +606,9 @@ def answers_as(line: SimulatedBus, counts: dict[int, int]) -> None:
     line.answers = answer
 
 
-def test_a_drive_that_lacks_another_makes_registers_is_checked_for_them_once(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_drive_that_lacks_another_makes_registers_is_checked_for_them_once() -> None:
     """An IBD does not answer reads of registers that it lacks. Each of them delays the drive's polling."""
-    line, drive, _ = one(monkeypatch, InnovertIBD(1, confirmed=1))
+    line, drive, _ = one(InnovertIBD(1, confirmed=1))
     count_silences(line)
     drive.set_frequency(20)
     foreign = [request for request, _ in line.frames if request.start == GOODRIVE_DEVICE]
@@ -621,8 +619,8 @@ def test_a_drive_that_lacks_another_makes_registers_is_checked_for_them_once(
     assert GOODRIVE_DEVICE not in {request.start for request, _ in line.frames}
 
 
-def test_another_make_is_recognised_although_its_first_reply_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, _ = one(monkeypatch, InnovertIBD(1, confirmed=1))
+def test_another_make_is_recognised_although_its_first_reply_is_lost() -> None:
+    line, drive, _ = one(InnovertIBD(1, confirmed=1))
     count_silences(line)
     answers_as(line, {GOODRIVE_DEVICE: GOODRIVE, 0x2100: 3, 0x0000: 0})
     line.loses = lambda request: len(line.frames) == 1
@@ -631,8 +629,8 @@ def test_another_make_is_recognised_although_its_first_reply_is_lost(monkeypatch
     assert line.written == []
 
 
-def test_every_other_make_is_excluded_after_an_earlier_silence(monkeypatch: pytest.MonkeyPatch) -> None:
-    line, drive, _ = one(monkeypatch, InnovertIBD(1, confirmed=1))
+def test_every_other_make_is_excluded_after_an_earlier_silence() -> None:
+    line, drive, _ = one(InnovertIBD(1, confirmed=1))
     count_silences(line)
     line.loses = lambda request: True
     with pytest.raises(NoReply):

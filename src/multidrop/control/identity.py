@@ -256,7 +256,7 @@ class IdentityCheck:
         return "" if findings.confirmed else findings.doubt
 
     def _is_in_step(self, drive: Drive) -> bool:
-        """Return True if the drive has answered all requests in time since its port was opened."""
+        """Return True if the drive has answered every request in time so far."""
         peer = self._exchanges.peers.of(drive)
         return not (peer.counters().late or peer.silences or peer.late_until_ns)
 
