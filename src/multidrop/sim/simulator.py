@@ -107,7 +107,10 @@ class Simulator:
 
     def forked(self) -> None:
         """Create new wake-up sockets in a forked child, because the old ones wake the parent's simulator."""
-        self._interrupted, self._interrupter = socket.socketpair()
+        if self._interrupter.fileno() >= 0:  # open
+            self._interrupted.close()
+            self._interrupter.close()
+            self._interrupted, self._interrupter = socket.socketpair()
 
     def close(self) -> None:
         for wire in self.wires:
