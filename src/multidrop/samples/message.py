@@ -99,7 +99,7 @@ def unpacked_size(data: bytes | memoryview) -> int:
 
 
 def _size(metadata: memoryview, body: memoryview) -> int:
-    message = _Table(metadata, _U32.unpack_from(metadata)[0])
+    message = _FlatbufferTable(metadata, _U32.unpack_from(metadata)[0])
     if message.number(0, _U16) != LATEST:
         raise ValueError("the Arrow metadata version is not 5")
     kind = message.number(1, _I8)
@@ -120,9 +120,7 @@ def _size(metadata: memoryview, body: memoryview) -> int:
     return size
 
 
-class _Table:
-    """A table of a flatbuffer."""
-
+class _FlatbufferTable:
     def __init__(self, data: memoryview, place: int) -> None:
         self._data = data
         self._place = place
@@ -138,9 +136,9 @@ class _Table:
         place = self._field(number)
         return int(kind.unpack_from(self._data, place)[0]) if place else 0
 
-    def table(self, number: int) -> _Table | None:
+    def table(self, number: int) -> _FlatbufferTable | None:
         place = self._field(number)
-        return _Table(self._data, place + _U32.unpack_from(self._data, place)[0]) if place else None
+        return _FlatbufferTable(self._data, place + _U32.unpack_from(self._data, place)[0]) if place else None
 
     def pairs(self, number: int) -> Any:
         place = self._field(number)

@@ -230,10 +230,10 @@ class FleetCommands:
             return {line: None if drives is None else list(drives)}, []
         await self._read_plant(f"the stop was NOT sent; {HARD_WIRED}")
         if drives is None:
-            return dict.fromkeys(self._described()), []
+            return dict.fromkeys(self._drives_by_line()), []
         found: dict[str, list[str] | None] = {}
         unknown: list[CommandAnswer] = []
-        there = [name for line in self._described().values() for name in line]
+        there = [name for line in self._drives_by_line().values() for name in line]
         for drive in [drive_meant(drive, there) for drive in drives]:
             try:
                 here = found.setdefault(self._find(drive), [])
@@ -264,8 +264,7 @@ class FleetCommands:
     def _path(self) -> ServerPath:
         return next((path for path in self._paths if path.is_open), self._paths[0])
 
-    def _described(self) -> dict[str, list[str]]:
-        """Return the names of the plant's drives, by line."""
+    def _drives_by_line(self) -> dict[str, list[str]]:
         found = {}
         for name, record in self._plant.records.items():
             line = record.value.get("line") if isinstance(record.value, dict) else None
@@ -291,7 +290,7 @@ class FleetCommands:
                 raise FleetError(f"{otherwise}: the fleet's plant cannot be read: {failure}") from None
 
     def _find(self, drive: str) -> str:
-        lines = self._described()
+        lines = self._drives_by_line()
         for line, drives in lines.items():
             if drive in drives:
                 return line
@@ -317,10 +316,10 @@ class FleetCommands:
 async def _first_answer(
     paths: Sequence[ServerPath], line: str, request: StopRequest, what: str, on_news: News
 ) -> CommandAnswer:
-    """Send a stop until a gateway answers or may have received it; return that answer or UNDER_WAY.
+    """Send a stop until a gateway answers, and return the answer; UNDER_WAY if the answer was lost.
 
-    Return NOT_SENT if no gateway can have received the stop within NO_MASTER_S, or if this client may not
-    send stops. While no gateway has received it, `on_news` gets a report that the stop is not sent yet.
+    Return NOT_SENT if no gateway has received the stop within NO_MASTER_S, or if this client may not send
+    stops. Until a gateway has received it, `on_news` gets a report that the stop is not sent yet.
     """
     loop = asyncio.get_running_loop()
     ends, reported = loop.time() + NO_MASTER_S, ""
@@ -342,7 +341,7 @@ async def _first_answer(
 async def _ask_all(paths: Sequence[ServerPath], line: str, request: StopRequest, what: str) -> CommandAnswer:
     """Send a stop on all server connections in parallel, and return the first answer.
 
-    Return UNDER_WAY if a gateway may have received the stop without answering. Raises NobodyThere if no
+    Return UNDER_WAY if a gateway may have received the stop but no answer came. Raises NobodyThere if no
     connection delivered the stop, and a server reports that the line has no master. Raises NotDelivered if
     all connections failed for other reasons.
     """

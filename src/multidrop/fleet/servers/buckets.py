@@ -137,7 +137,7 @@ class ServerError(FleetError):
 
 
 class Bucket:
-    """A bucket of records. `path` returns the server connection to use for each request."""
+    """A bucket of records on NATS servers. `path` returns the server connection to use for each request."""
 
     def __init__(self, name: str, path: Callable[[], ServerPath]) -> None:
         self.name = name
@@ -215,7 +215,6 @@ class Bucket:
         return [self._record(*message) for message in messages]
 
     def _subject(self, key: str) -> str:
-        """Return the NATS subject on which a record is written."""
         return f"$KV.{self.name}.{key}"
 
     def _pattern(self, key: str) -> str:

@@ -58,9 +58,7 @@ class Rank(IntEnum):
     STOPS = 4  # the request may be a stop
 
 
-class _Open:
-    """The state of one open connection."""
-
+class _OpenConnection:
     __slots__ = ("ends", "fresh_until", "is_busy", "is_greedy", "is_stop", "peer", "stalled_since")
 
     def __init__(self, peer: socket.socket, now: float) -> None:
@@ -94,7 +92,7 @@ class Connections:
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
-        self._open: dict[tuple[str, int], _Open] = {}
+        self._open: dict[tuple[str, int], _OpenConnection] = {}
         self.ended = 0  # number of connections that this object has closed
 
     def add(self, peer: socket.socket, address: Any) -> None:
@@ -102,7 +100,7 @@ class Connections:
         self._forget_closed()
         self._open.pop(address[:2], None)
         now = self._clock()
-        self._open[address[:2]] = _Open(peer, now)
+        self._open[address[:2]] = _OpenConnection(peer, now)
         while len(self._open) > MOST_OPEN:
             ranks = {client: one.rank(now) for client, one in self._open.items() if client != address[:2]}
             fresh = [client for client, rank in ranks.items() if rank is Rank.FRESH]
@@ -148,8 +146,7 @@ class Connections:
     def finish(self, client: tuple[str, int] | None) -> None:
         """Note that a request of this client was answered."""
         if client in self._open:
-            # moved to the end of the order
-            found = self._open[client] = self._open.pop(client)
+            found = self._open[client] = self._open.pop(client)  # now the last one in `_open`
             found.is_busy = found.is_stop = False
             found.fresh_until, found.ends = 0.0, self._clock() + AGAIN_S
 

@@ -108,7 +108,7 @@ def read_files(folder: Path) -> dict[str, PageFile]:
 
 
 def _texts_by_language(catalogue: str) -> dict[str, PageFile]:
-    """Return a JSON file of translations by English text for each language, such as texts.ru.json."""
+    """Return a JSON file for each language, such as texts.ru.json: translations by their English text."""
     texts: dict[str, dict[str, str]] = defaultdict(dict)
     for english, translations in tomllib.loads(catalogue).items():
         for language, text in translations.items():

@@ -161,9 +161,9 @@ class Guard:
     def _admit(self, scope: Scope, headers: Headers, needed: Right) -> Caller:
         """Return the caller of a request that needs the right `needed`. Raises Denied if the caller lacks it.
 
-        A request with a wrong token is refused even if it needs no token, except a stop. After several wrong
-        tokens, requests from that address with a token are refused for a while, except stops: their tokens
-        are always checked.
+        A request with a wrong token is refused, even if it needs no token. After several wrong tokens, all
+        tokens from that address are refused for a while. Stops are different: their tokens are always
+        checked, and a wrong one is ignored if anyone may stop.
         """
         address = self.address(scope, headers)
         local = is_loopback(address) and not self._behind_proxy

@@ -267,7 +267,7 @@ class Alarms:
         self._known.add(key[:2])
         if before is not None and (text in (before.text, UNNAMED) or kind == SILENT):
             return
-        is_less = kind == LIMIT and before is not None and _parts(text) < _parts(before.text)
+        is_less = kind == LIMIT and before is not None and _exceeded_in(text) < _exceeded_in(before.text)
         if before is not None and (before.text == UNNAMED or kind == PORT or is_less):
             # the same alarm continues, with a new text
             self._lasting[key] = before._replace(text=text)
@@ -287,8 +287,7 @@ class Alarms:
             self._note(self._ended[-1], AlarmChange.ENDED)
 
 
-def _parts(text: str) -> set[str]:
-    """Return the exceeded limits that the text of an alarm of kind LIMIT lists."""
+def _exceeded_in(text: str) -> set[str]:
     return {*text.split(SEPARATOR)}
 
 

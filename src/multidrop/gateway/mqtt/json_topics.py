@@ -136,14 +136,13 @@ class JsonTopics:
         return "/".join((self._settings.prefix, *levels))
 
     @staticmethod
-    def _kept(topic: str, payload: bytes) -> Publication:
-        """Return a message with the retain flag."""
+    def _retained(topic: str, payload: bytes) -> Publication:
         return Publication(topic, lambda: payload, is_retained=True)
 
     # ---- the methods of Speaker ----
 
     def will(self) -> Publication:
-        return self._kept(self._topic("gateway"), OFFLINE)
+        return self._retained(self._topic("gateway"), OFFLINE)
 
     def topics(self) -> list[tuple[str, int]]:
         kept = [(topic, 0) for topic in self._retained_topics.topics()]
@@ -155,7 +154,7 @@ class JsonTopics:
     def connected(self) -> None:
         self._available.clear()
         self._retained_topics.begin()
-        self.outbox.put(self._kept(self._topic("gateway"), ONLINE))
+        self.outbox.put(self._retained(self._topic("gateway"), ONLINE))
         # repeat the deletions, because the previous connection may have broken before the broker got them
         self._take_back()
         if self._settings.home_assistant:
@@ -182,7 +181,7 @@ class JsonTopics:
         if not self._plant.lines:  # the plant of a fleet has no lines until the fleet's files are read
             return
         for left in self._retained_topics.hear(topic, payload, drives_of(self._plant)):
-            self.outbox.put(self._kept(left, NOTHING))
+            self.outbox.put(self._retained(left, NOTHING))
 
     def _command(self, levels: list[str], payload: bytes, *, is_retained: bool) -> None:
         drive, *what = levels
@@ -236,7 +235,7 @@ class JsonTopics:
             if self._settings.home_assistant:
                 topics.append(discovery_topic(self._settings.prefix, drive))
             for topic in topics:
-                self.outbox.put(self._kept(topic, NOTHING))
+                self.outbox.put(self._retained(topic, NOTHING))
 
     # ---- published messages ----
 
@@ -252,7 +251,7 @@ class JsonTopics:
             available = OFFLINE if self._hub.state(drive) == SILENT else ONLINE
             if self._available.get(drive) != available:
                 self._available[drive] = available
-                self.outbox.put(self._kept(self._topic(drive, "available"), available))
+                self.outbox.put(self._retained(self._topic(drive, "available"), available))
 
     def leave(self) -> None:
         """Publish that the gateway and all drives are offline.
@@ -261,7 +260,7 @@ class JsonTopics:
         """
         self.outbox.put(self.will())
         for drive in self._available:
-            self.outbox.put(self._kept(self._topic(drive, "available"), OFFLINE))
+            self.outbox.put(self._retained(self._topic(drive, "available"), OFFLINE))
         self._available.clear()
 
     def _state(self, drive: str) -> bytes:
@@ -302,7 +301,7 @@ class JsonTopics:
             takes_commands=self._settings.commands,
             page=self._context.page,
         )
-        self.outbox.put(self._kept(discovery_topic(self._settings.prefix, name), payload))
+        self.outbox.put(self._retained(discovery_topic(self._settings.prefix, name), payload))
 
 
 def _read_write(given: Mapping[str, Any]) -> tuple[float, int]:

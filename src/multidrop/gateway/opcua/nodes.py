@@ -225,22 +225,22 @@ class PlantNodes:
                     await asyncio.sleep(0)
 
     async def _add_drive(self, name: str, polled: PolledDrive) -> None:
-        drive, stop = polled.drive, _id(name, STOP)
+        drive, stop = polled.drive, _node_id(name, STOP)
         registers = {poll.register.name: poll.register for poll in polled.series}
-        variables = {member: _id(name, member) for member in (*registers, STATE, FAULT)}
+        variables = {member: _node_id(name, member) for member in (*registers, STATE, FAULT)}
         items = [
-            _object(PLANT, _id(name), name, drive.title),
-            *_method(_id(name), stop, _id(name, STOP, "OutputArguments"), "Stop this drive."),
-            _variable(_id(name), variables[STATE], STATE, "runs, stands, fault, silent or unknown", str),
-            _variable(_id(name), variables[FAULT], FAULT, "what the drive shows as its fault", str),
+            _object(PLANT, _node_id(name), name, drive.title),
+            *_method(_node_id(name), stop, _node_id(name, STOP, "OutputArguments"), "Stop this drive."),
+            _variable(_node_id(name), variables[STATE], STATE, "runs, stands, fault, silent or unknown", str),
+            _variable(_node_id(name), variables[FAULT], FAULT, "what the drive shows as its fault", str),
         ]
         for member, register in registers.items():
             kind, unit = str if register.values is not None else float, register.value_unit
             type_of = "AnalogUnitType" if unit and kind is float else "BaseDataVariableType"
             text = register.note or member
-            items.append(_variable(_id(name), variables[member], member, text, kind, type_of))
+            items.append(_variable(_node_id(name), variables[member], member, text, kind, type_of))
             if unit and kind is float:
-                items.append(_unit(variables[member], _id(name, member, "EngineeringUnits"), unit))
+                items.append(_unit(variables[member], _node_id(name, member, "EngineeringUnits"), unit))
         nodes = await self._add(*items)
         found = {}
         for member, node in variables.items():
@@ -256,14 +256,14 @@ class PlantNodes:
         Subscribers of the drive's values get a bad status as their last notification.
         """
         drive, space = self._drives.pop(name), self._space
-        del self.stops[_id(name, STOP)]
+        del self.stops[_node_id(name, STOP)]
         for member, (variable, attribute) in drive.variables.items():
             variable.state = VariableState(name, member, REMOVED, None, 0)
             await _notify(variable, attribute)
             for handle in [*attribute.datachange_callbacks]:
                 space.delete_datachange_callback(handle)
         of_plant = space[PLANT].references
-        of_plant[:] = [one for one in of_plant if one.NodeId != _id(name)]
+        of_plant[:] = [one for one in of_plant if one.NodeId != _node_id(name)]
         for node in drive.nodes:
             del space[node]
 
@@ -296,11 +296,10 @@ async def _notify(variable: _Variable, attribute: AttributeValue) -> None:
 
 def object_of(drive: str | None) -> ua.NodeId:
     """Return the id of a drive's object; of the plant's object if `drive` is None."""
-    return PLANT if drive is None else _id(drive)
+    return PLANT if drive is None else _node_id(drive)
 
 
-def _id(*names: str) -> ua.NodeId:
-    """Return the id of a drive's object, or of a node in this object."""
+def _node_id(*names: str) -> ua.NodeId:
     return ua.NodeId(".".join(names), INDEX)
 
 
