@@ -225,6 +225,16 @@ def test_adding_a_gateway_keeps_all_existing_keys(tmp_path: Path) -> None:
     assert {str(path): path.read_text() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
+def test_ipv6_addresses_of_servers_are_in_brackets(tmp_path: Path) -> None:
+    from multidrop.fleet.servers.files import write_files
+
+    write_files(tmp_path, ["gw-1"], ["nats://[::1]:4222", "nats://[::1]:4223"], None)
+    text = (tmp_path / "n1.conf").read_text()
+    assert 'listen: "[::1]:4222"' in text
+    assert 'listen: "[::1]:6222"' in text
+    assert "@[::1]:6223" in text
+
+
 # ---- the command `fleet rights` ----
 
 

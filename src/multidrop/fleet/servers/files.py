@@ -62,7 +62,8 @@ def addresses_of(urls: Sequence[str]) -> list[ServerAddress]:
             port = MOST_PORTS
         if not parts.hostname or port + ROUTE_PORTS > MOST_PORTS:
             raise ValueError(f"{masked(url)} is not an address of a NATS server: write nats://host:4222")
-        found.append(ServerAddress(f"n{number}", parts.hostname, port))
+        host = f"[{parts.hostname}]" if ":" in parts.hostname else parts.hostname
+        found.append(ServerAddress(f"n{number}", host, port))
     return found
 
 
