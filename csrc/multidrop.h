@@ -204,8 +204,8 @@ enum md_transactions {
 enum md_rs485_mode {
     MD_RS485_OFF,     /* the adapter itself */
     MD_RS485_KERNEL,  /* the kernel's driver, as it is configured */
-    MD_RS485_RTS_UP,  /* this port, by RTS: on while it sends, otherwise off */
-    MD_RS485_RTS_DOWN /* this port, by RTS: off while it sends, otherwise on */
+    MD_RS485_RTS_UP,  /* RTS: on while this port sends, otherwise off */
+    MD_RS485_RTS_DOWN /* RTS: off while this port sends, otherwise on */
 };
 
 /* A request with its drive, timing and settings; constant while in use. Fields that every exchange needs come

@@ -264,7 +264,6 @@ class Poller(RowSource):
         return {name: since_ns for line in self._lines for name, since_ns in line.since_ns.items()}
 
     def _adopt_channels(self) -> None:
-        """Compute the channels of the drives that are polled now."""
         self._added.adopt(self.plant, self.polled_since)
 
     def adopt(self, plant: Plant | Path | str) -> dict[str, LineError]:

@@ -50,7 +50,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _installed() -> Iterator[type[Drive]]:
-    """Yield the families of installed packages; print a warning for each that cannot be loaded."""
     for name in installed_models():
         try:
             yield find_model(name)
@@ -285,7 +284,6 @@ def _table_heading(table: Table, family: type[Drive]) -> str:
 
 
 def _registers(family: type[Drive], table: Table) -> Iterator[str]:
-    """Yield a table row for each register, followed by remarks on the register."""
     registers = [register for register in family.registers.values() if register.table is table]
     rows = aligned([_row(register) for register in registers], "<<<<<")
     for register, row in zip(registers, rows, strict=True):

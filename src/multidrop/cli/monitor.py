@@ -302,7 +302,6 @@ class Monitor:
             self._carry_out(*stops[line])
 
     def _in_background(self, what: str, work: Callable[[], tuple[str, list[str]]]) -> None:
-        """Carry out a stop in a new thread, or in the calling thread if no thread can be started."""
         if not self._begin(what, work):
             self._carry_out(what, work)
 

@@ -266,7 +266,6 @@ def _list(arguments: argparse.Namespace) -> int:
 
 
 def _drive_of(arguments: argparse.Namespace, words: Sequence[str]) -> tuple[Target, list[str]]:
-    """Return the drive that the first words name, and the remaining words."""
     return target_of(argparse.Namespace(**vars(arguments) | {"words": [*words]}))
 
 
@@ -297,7 +296,6 @@ def _change_as_json(change: params.ParameterChange) -> dict[str, Any]:
 
 
 def _reason(not_written: NotWritten) -> str:
-    """Return why a parameter was not written, with advice in words of the command line."""
     if isinstance(not_written, WriteForbidden):
         return not_written.for_command_line()
     return str(not_written)

@@ -101,7 +101,6 @@ def _import_library(out: Path) -> None:
 
 
 def _warn_truncated(path: Path, rows: int, left_out: int) -> None:
-    """Warn that a recording ends with `left_out` bytes of an incomplete row, after `rows` complete rows."""
     if left_out:
         warn(
             f"{path} ends within a row: {counted(rows, 'row')} read, "

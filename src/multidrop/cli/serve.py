@@ -230,5 +230,4 @@ def _new_token(role: str | None, owner: str | None) -> int:
 
 
 def _levels(level: int) -> dict[str, int]:
-    """Return the log levels by logger; `level` is that of the library's own messages."""
     return {"multidrop": level, "uvicorn": logging.WARNING, "asyncio": logging.WARNING}

@@ -110,7 +110,6 @@ def _line(arguments: argparse.Namespace, plant: Plant | None) -> PlantLine | Non
 
 
 def _settings(arguments: argparse.Namespace, line: PlantLine | None) -> Settings:
-    """Return the settings in the arguments. If one is missing, take that of most drives on the line."""
     usual = usual_settings(line)
     baudrate = usual.baudrate if arguments.baudrate is None else arguments.baudrate
     return Settings(baudrate, arguments.format or usual.format)

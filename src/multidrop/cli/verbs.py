@@ -207,7 +207,6 @@ def _rehearse(script: Script[Any]) -> None:
 
 
 def _details(arguments: argparse.Namespace) -> str:
-    """Return the requested setpoint and direction as words for the question to the user."""
     hz, direction = (getattr(arguments, name, None) for name in ("frequency", "direction"))
     at = "to" if arguments.command == "set-frequency" else "at"
     return ("" if hz is None else f" {at} {hz:g} Hz") + (f", {direction}" if direction else "")

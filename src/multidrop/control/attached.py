@@ -235,7 +235,6 @@ class Leaving:
 
 
 def _warn_of(found: Mapping[str, Stopped]) -> None:
-    """Log each drive whose motor was not seen to stop."""
     for stopped in found.values():
         if not stopped.ok:
             log_aside(_log, logging.WARNING, "%s", stopped)

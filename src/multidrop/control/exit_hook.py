@@ -187,7 +187,6 @@ class ExitHook:
         self._has_taken = True
 
     def _warn_of_replaced(self) -> None:
-        """Log which signals will not stop drives, because the program has replaced our handler."""
         if lost := [number.name for number in _SIGNALS if signal.getsignal(number) != self._on_signal]:
             _log.warning(REPLACED, " and ".join(lost))
 

@@ -186,10 +186,10 @@ class Performer:
 
 
 def _check(step: Step, call: Call, cancelled: list[CancelledByStop]) -> None:
-    """Raise CancelledByStop in the script if a stop was called, and _Over if the script continues anyway.
+    """Raise CancelledByStop if a stop was called, and _Over if the script then continues.
 
-    After a stop, a verb's script ends at any step, another script at its next write. An `Insist` step is
-    always carried out, because it is harmless and undoes an earlier write.
+    A verb's script ends at its next step, any other script at its next write. An `Insist` step is always
+    carried out, because it is harmless and undoes an earlier write.
     """
     if isinstance(step, Insist) or not (call.verb or isinstance(step, Write)) or call.permit.is_good:
         return

@@ -132,7 +132,6 @@ def check_author() -> None:
 
 @contextmanager
 def _within(variable: ContextVar[T], value: T) -> Iterator[None]:
-    """Set the variable within the block, in this thread or task."""
     token = variable.set(value)
     try:
         yield

@@ -223,7 +223,8 @@ class StopAttempt:
     def _goes_on(self, failure: Exception, now: float) -> bool:
         limit = LEAST_S if self._seconds is None else self._seconds
         if isinstance(failure, NotMaster) and not failure.heard:
-            self._log_unsent(failure)
+            if not self.is_sent:  # no other process will stop the motor
+                log_aside(_log, logging.CRITICAL, "%s", failure.of_a_stop())
             return False
         if not _is_worth_repeating(failure) or now >= self._begun + limit:
             return False
@@ -233,11 +234,6 @@ class StopAttempt:
         self._begin()
         self.due = now + PAUSE_S
         return True
-
-    def _log_unsent(self, failure: NotMaster) -> None:
-        """Log as critical, without waiting, that no stop was sent: no other process will stop the motor."""
-        if not self.is_sent:
-            log_aside(_log, logging.CRITICAL, "%s", failure.of_a_stop())
 
     def once_more(self, do: Do) -> None:
         """Send the stop again without waits, because its caller was interrupted.
@@ -316,7 +312,7 @@ class StopAttempt:
 
 
 def _noting_return(make: Callable[[], Script[Any]], returned: list[bool]) -> Script[None]:
-    """Carry out a script. Append to `returned` if no signal or MemoryError ended the script."""
+    """Carry out a script; then append to `returned`, to show that no signal or MemoryError ended it."""
     yield from make()
     returned.append(True)
 

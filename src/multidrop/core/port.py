@@ -463,7 +463,8 @@ class Port:
     def repeat(self, exchanges: Sequence[Exchange]) -> int:
         """Carry out these exchanges in turn, whenever no queued exchange is due, until the next call.
 
-        Return the index of the exchange that would have come next before this call; 0 on a closed port.
+        Return the index, among the earlier exchanges, of the one that would have come next; 0 on a closed
+        port.
         """
         if self.c is None:
             return 0

@@ -57,7 +57,7 @@ def proofs(drive: Drive) -> list[tuple[Block, RawRange | None]]:
 
 @lru_cache(maxsize=256)
 def _told_apart(family: Any) -> tuple[tuple[Register[Any], ...], ...]:
-    """Return groups of registers whose replies can be distinguished from each other (see `_shape`).
+    """Return groups of registers; the reply to a group's read differs from those of all other groups.
 
     Groups of readings come first, because readings are polled anyway; shorter requests come before longer
     ones. If there are many groups, only the first MOST_PROOFS and the last one are returned.

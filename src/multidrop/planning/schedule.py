@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from typing import Generic, NamedTuple, TypeVar
 
 TURN_SHARE = 0.05  # least fraction of the line's time for jobs without a period
-# limit of the line time that jobs without a period can use before they are entitled to it
+# limit of the line time that jobs without a period may use in advance
 CREDIT_NS = 50_000_000
 NEVER_NS = 1 << 63
 SILENT_AFTER = 2  # number of successive failures after which a drive gets no requests for a while
@@ -113,7 +113,7 @@ class BackOff:
             self.health[drive].is_pending = False
 
     def may_sleep(self, at_ns: int) -> bool:
-        """Return True if a drive on the line may get no request now."""
+        """Return True if any drive may be resting now; see `is_asleep`."""
         return self.has_silent or at_ns < self._late_until_ns
 
     def is_asleep(self, drive: int, at_ns: int) -> bool:

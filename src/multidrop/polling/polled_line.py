@@ -113,7 +113,7 @@ STANDBY_NS = 500_000_000
 RETRY_NS = 500_000_000  # pause before polling is retried after a failure; each further failure doubles it
 LONGEST_RETRY_NS = 30_000_000_000
 SOUND_NS = 10_000_000_000  # time without failures of polling after which earlier failures are forgotten
-# plan again if the response delay leaves the range for which the plan is best by more than this fraction
+# plan again if a response delay is outside the plan's best range by more than this fraction
 MARGIN = 0.05
 
 

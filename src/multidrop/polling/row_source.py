@@ -46,7 +46,6 @@ _DEFERS = (
 
 
 def _check_returned(function: object, returned: object) -> None:
-    """Raise TypeError if the function returned a coroutine or a generator."""
     if isinstance(returned, Awaitable | Generator | AsyncIterator):
         if inspect.iscoroutine(returned):
             returned.close()  # otherwise Python also warns that the coroutine was never awaited

@@ -108,7 +108,6 @@ def value_text(register: Register[Any], value: float) -> str:
 
 
 def _number(register: Register[Any], value: float) -> str:
-    """Return the value as text without its unit."""
     return register.format(value).partition(" ")[0]
 
 
