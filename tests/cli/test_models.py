@@ -77,7 +77,7 @@ def test_a_model_file_is_loaded_once_so_its_drives_share_a_class(fan: Path) -> N
 
 def test_a_class_missing_in_a_model_file_is_reported(fan: Path) -> None:
     here = fan.parent
-    assert refused("fun.py:Fan", here) == f"there is no file {here}/fun.py to take a model from"
+    assert refused("fun.py:Fan", here) == f"the model file {here}/fun.py does not exist"
     assert refused("fan.py", here) == "fan.py names no class; write fan.py:Fan"
     assert refused("fan.py:Pan", here) == "fan.py has no class 'Pan'; write fan.py:Fan"
     for name in ("Empty", "LIMIT", "Drive"):

@@ -306,7 +306,7 @@ def _fits_table(register: Register[Any]) -> bool:
     return register.number_format is wanted
 
 
-# Number formats of which a register may be only a range of bits, its `part`.
+# Number formats whose bits a register may use only in part.
 _PARTED = frozenset(
     {
         *(NumberFormat.U16, NumberFormat.U32, NumberFormat.U64),
@@ -502,7 +502,7 @@ def _meaning(register: Register[Any]) -> object:
 
 
 def request_errors(family: Any) -> list[str]:
-    """Link registers to their scale registers; return a sentence for each wrong scale, limit or group."""
+    """Link registers to their scale registers; return the errors in scales, limits and groups."""
     wrong = list(_scale_errors(family)) or list(_limit_errors(family))
     if wrong:
         return wrong

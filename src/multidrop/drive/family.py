@@ -172,7 +172,6 @@ class Drive(RegisterAccess):
 
     @classmethod
     def _kind(cls) -> str:
-        """Return the title of the family, else the name of its class."""
         return cls.title or cls.__name__
 
     @classmethod
@@ -244,7 +243,7 @@ class Drive(RegisterAccess):
             self.response_delay, self.response_delay_characters * self.settings.character
         )
         self.name = name or f"{self.model or type(self).__name__}@{address}"
-        if not self.name.isprintable():  # a line break would make a text recording look truncated
+        if not self.name.isprintable():  # a line break would split a row of a .csv recording
             raise ValueError(f"the name {name!r} is not one line of printable characters")
         self.option = checked_options(self._kind(), self.options, options)
         self.ram = frozenset(self._in_ram(name) for name in ram)

@@ -101,6 +101,5 @@ def can_show_fault(drive: Drive, polled: Collection[str]) -> bool:
 
 
 def _choices(register: Register[Any]) -> list[float]:
-    """Return the values to try for a register: 0, 1 and every named value."""
     members: list[Any] = [] if register.values is None else list(cast(Any, register.values))
     return [0.0, 1.0, *(float(member.value) for member in members)]

@@ -146,7 +146,7 @@ def _load(path: Path) -> ModuleType:
     except OSError as failure:
         raise ValueError(f"no model can be read from {path}: {failure.strerror}") from failure
     if not is_there:
-        raise ValueError(f"there is no file {path} to take a model from")
+        raise ValueError(f"the model file {path} does not exist")
     return load_model_file(path)
 
 

@@ -93,7 +93,7 @@ def grid_of(begin: int, end: int, points: int) -> Grid:
         needed = -(-(end - first) // step)
         if needed <= max(points, 2):  # even with `points` = 1, the range may overlap two aligned buckets
             return Grid(first, step, needed)
-    raise AssertionError("steps grow for ever")
+    raise AssertionError("unreachable: the bucket lengths have no limit")
 
 
 def _handy_steps(least: int) -> Iterator[int]:

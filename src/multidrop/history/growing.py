@@ -136,7 +136,6 @@ class GrowingSegment:
         return range(found[0], found[-1] + 1) if found else range(0)
 
     def _read(self, number: int, series: frozenset[Series]) -> Iterator[SeriesRow]:
-        """Yield the rows of the series in the batch with this number."""
         columns = self._tail.again(self._batches[number].place)
         for at in _places(columns, _codes(columns.drives, columns.registers, series)):
             name = columns.drives[columns.drive[at]], columns.registers[columns.register[at]]

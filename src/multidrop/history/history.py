@@ -294,7 +294,6 @@ class HistoryRows(RecordingReader):
 
 
 def _renamed(rows: list[Row], others: Iterable[OtherColumn]) -> list[Row]:
-    """Return a segment's rows. Registers with an earlier unit are renamed to their separate columns."""
     columns = {other.series: other.column for other in others}
     if not columns:
         return rows

@@ -107,7 +107,7 @@ def _text(data: bytes) -> str:
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as failure:
-        raise ValueError(f"is not text in UTF-8, from byte {failure.start} on") from failure
+        raise ValueError(f"the file is not text in UTF-8, from byte {failure.start} on") from failure
 
 
 _READERS: Mapping[str, Callable[[bytes, Path], list[ImportedDevice]]] = {

@@ -127,16 +127,16 @@ Cells = Mapping[str, str]
 def read_table(text: str, stem: str) -> list[ImportedDevice]:
     """Return the devices of a table. Raises ValueError if the table has no address column or no row."""
     if "\0" in text:
-        raise ValueError("has zero bytes; save it as CSV UTF-8")
+        raise ValueError("the file has zero bytes; save it as CSV UTF-8")
     lines = [line for line in text.splitlines() if line.strip() and not _COMMENT.match(line)]
     if not lines:
-        raise ValueError("is empty: it has only comments")
+        raise ValueError("the file is empty: it has only comments")
     head = lines[0] if re.search("[,;\t]", lines[0]) else "\n".join(lines[:MOST_TITLES])
     delimiter = max((",", ";", "\t"), key=head.count)
     try:
         rows = list(csv.reader(io.StringIO("\n".join(lines)), delimiter=delimiter))
     except csv.Error as failure:
-        raise ValueError(f"is not CSV: {failure}") from failure
+        raise ValueError(f"the file is not CSV: {failure}") from failure
     if rows[0] and rows[0][0].strip().lower() in ("device", "poll", "ref"):
         return read_modpoll(rows)
     names = ([_plain_name(cell)[0] for cell in row] for row in rows[:MOST_TITLES])
@@ -162,7 +162,7 @@ def _columns(rows: list[list[str]], stem: str) -> list[ImportedDevice]:
         with table.entry(cells.get("name", "")):
             _row(devices, cells, layout.gaps(cells, further), stem)
     if not devices and not table.lost:
-        raise ValueError("has no row with an address, below the line that names the columns")
+        raise ValueError("the file has no row with an address, below the line that names the columns")
     first = next(iter(devices.values()), table)
     for name in sorted(unknown)[:MOST_UNKNOWN]:
         first.lose(f"the column {name[:40]}", "is not known here, and was not carried over", is_entry=False)
@@ -292,7 +292,6 @@ def _referred(register: ImportedRegister, given: str, stated: str | None, cells:
 
 
 def _is_number(cells: Cells) -> bool:
-    """Return True if the register of a row is a number and not a bit."""
     kind = cells.get("type", "").lower()
     if kind:
         return kind not in _BIT_TYPES

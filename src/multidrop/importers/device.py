@@ -246,7 +246,7 @@ class ImportedDevice:
         Raises ValueError if there are too many entries.
         """
         if len(self.registers) + len(self.texts) + len(self.lost) >= MOST_ENTRIES:
-            raise ValueError(f"has more than {MOST_ENTRIES} entries; no device has so many")
+            raise ValueError(f"the file has more than {MOST_ENTRIES} entries; no device has so many")
         try:
             yield
         except KeyError as failure:

@@ -101,7 +101,7 @@ def read_esphome(document: Any) -> list[ImportedDevice]:
         for kind, entry in _entries(part):
             devices.add(kind, entry)
     if not (found := devices.found):
-        raise ValueError(f"has no entity with `platform: {PLATFORM}` in {', '.join(KEYS)}")
+        raise ValueError(f"the file has no entity with `platform: {PLATFORM}` in {', '.join(KEYS)}")
     return found
 
 

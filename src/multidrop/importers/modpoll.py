@@ -37,7 +37,7 @@ def read_modpoll(rows: list[list[str]]) -> list[ImportedDevice]:
                     raise ValueError(f"row {number} has more than {_CELLS} cells")
                 _reference(devices[-1], cells, table, order)
         else:
-            raise ValueError(f"is not a modpoll table: row {number} is {','.join(row)[:40]!r}")
+            raise ValueError(f"the file is not a modpoll table: row {number} is {','.join(row)[:40]!r}")
     return devices
 
 

@@ -66,7 +66,6 @@ def read_sunspec(document: Mapping[str, Any]) -> list[ImportedDevice]:
 
 
 def _size(point: Mapping[str, Any]) -> int:
-    """Return how many registers a point has. Raises ValueError if its size is missing."""
     try:
         return whole(point, "size")
     except KeyError:

@@ -83,7 +83,7 @@ def read_telegraf(document: Mapping[str, Any]) -> list[ImportedDevice]:
     plugins = inputs.get("modbus") if isinstance(inputs, dict) else None
     if plugins is None:
         tables = ", ".join(str(key)[:40] for key in list(document)[:8]) or "nothing"
-        raise ValueError(f"has no [[inputs.modbus]] (Telegraf): it has {tables}")
+        raise ValueError(f"the file has no [[inputs.modbus]] (Telegraf): it has {tables}")
     found: dict[tuple[LineSettings, int | None], ImportedDevice] = {}
     for plugin in plugins if isinstance(plugins, list) else [plugins]:
         line, title = _line(plugin), str(plugin.get("name", ""))

@@ -90,15 +90,15 @@ def read_wb(document: Any) -> list[ImportedDevice]:
     """Return the devices of a template or of a configuration. Raises ValueError for other documents."""
     if not isinstance(document, dict):
         kind = type(document).__name__
-        raise ValueError(f"is neither a wb-mqtt-serial template nor a SunSpec model: it is a {kind}")
+        raise ValueError(f"the file is neither a wb-mqtt-serial template nor a SunSpec model: it is a {kind}")
     if isinstance(ports := document.get("ports"), list):
         return [device for port in ports for device in _of_port(port)]
     template = document.get("device", document)
     if not isinstance(template, dict) or not {"channels", "parameters", "subdevices"} & template.keys():
         keys = ", ".join(str(key)[:40] for key in list(document)[:8])
         raise ValueError(
-            "has no `device` with channels or parameters (wb-mqtt-serial) and no `group` with points "
-            f"(SunSpec): its keys are {keys}"
+            "the file has no `device` with channels or parameters (wb-mqtt-serial) and no `group` with "
+            f"points (SunSpec): its keys are {keys}"
         )
     title = str(document.get("title") or template.get("name") or "")
     device = _device(template, title, None, UNKNOWN_LINE)
@@ -137,7 +137,7 @@ def _device(
 ) -> ImportedDevice:
     protocol = str(template.get("protocol", "modbus"))
     if not protocol.startswith("modbus"):
-        raise ValueError(f"is a template of another protocol than Modbus: {protocol[:40]!r}")
+        raise ValueError(f"the file is a template of another protocol than Modbus: {protocol[:40]!r}")
     device = ImportedDevice(title, address, line=line)
     most = template.get("max_read_registers")
     device.together = most if isinstance(most, int) and 1 <= most <= MOST_READ else 0

@@ -26,7 +26,7 @@ def parse_yaml(text: str) -> Any:
     except ImportError as failure:
         raise ImportError(f"YAML is read with PyYAML: {install_command('yaml')}") from failure
     if len(text) > MOST_CHARACTERS:
-        raise ValueError(f"has more than {MOST_CHARACTERS} characters of YAML")
+        raise ValueError(f"the file has more than {MOST_CHARACTERS} characters of YAML")
 
     class Loader(yaml.SafeLoader):  # type: ignore[misc]
         """Limits the number of nodes."""
@@ -41,7 +41,7 @@ def parse_yaml(text: str) -> Any:
                 self.count_again(node)
             if self.left < 0:
                 raise ValueError(
-                    f"has more than {MOST_NODES} entries, if each alias is replaced by its entries"
+                    f"the file has more than {MOST_NODES} entries, if each alias is replaced by its entries"
                 )
             return node
 
@@ -60,9 +60,9 @@ def parse_yaml(text: str) -> Any:
     try:
         return yaml.load(text, Loader)
     except yaml.YAMLError as failure:
-        raise ValueError(f"is not YAML: {' '.join(str(failure).split())[:300]}") from failure
+        raise ValueError(f"the file is not YAML: {' '.join(str(failure).split())[:300]}") from failure
     except RecursionError as failure:
-        raise ValueError("is YAML that is nested too deeply") from failure
+        raise ValueError("the file is YAML that is nested too deeply") from failure
 
 
 def _spelt(suffix: str, value: Any) -> str:

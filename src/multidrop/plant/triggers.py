@@ -69,7 +69,6 @@ def _references(condition: str) -> list[TriggerSeries]:
 
 
 def _polled(plant: Plant, drive: str) -> list[TriggerSeries]:
-    """Return the polled registers of a drive."""
     own = next(polled for polled in plant.drives if polled.drive.name == drive)
     return [(drive, poll.register.name) for poll in own.polls]
 
@@ -85,7 +84,6 @@ def _showing_faults(plant: Plant) -> list[str]:
 
 
 def _with_channel(plant: Plant, channel: Channel, drives: Collection[str]) -> Plant:
-    """Return a plant in which the drives with these names have this channel."""
 
     def extended(polled: PolledDrive) -> PolledDrive:
         more = [channel] if polled.drive.name in drives else []

@@ -117,7 +117,6 @@ def _column(field: FlatTable) -> FileColumn:
 
 
 def _dictionary(field: FlatTable) -> int | None:
-    """Return the id of a column's dictionary, or None if it has none."""
     coded = field.table(4)
     return coded.number(0, "<q") if coded else None
 

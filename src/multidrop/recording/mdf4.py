@@ -77,7 +77,6 @@ class Mdf4Writer(SeriesWriter):
         )
 
     def _seconds(self, time: Array) -> Array:
-        """Convert times from ns UTC to s since the start of the recording."""
         return np.asarray((time - self.begin_ns) / 1e9)
 
     def _add_event(self, event: Event) -> None:

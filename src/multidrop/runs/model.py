@@ -192,8 +192,8 @@ def timeline(steps: Iterable[RunStep]) -> list[PlannedStep]:
             if step.rate:
                 if name not in known:
                     raise ValueError(
-                        f"{step.name}: a ramp starts at the frequency of an earlier step: set one there for "
-                        f"{name}"
+                        f"{step.name}: the ramp of {name} needs a frequency to start from; set one in an "
+                        "earlier step"
                     )
                 ramps.append(abs(hz - known[name]) / step.rate)
             known[name] = hz

@@ -261,7 +261,6 @@ class _Session:
         return [sentence for thread in self._row_threads if (sentence := thread.end())]
 
     def _raise_failure(self) -> None:
-        """Raise the error of the recording or of a callback, if there is one."""
         for thread in self._row_threads:
             if thread.failure is not None:
                 raise thread.failure

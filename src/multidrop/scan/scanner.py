@@ -75,7 +75,7 @@ class _Scan:
     def __init__(self, carry_out: CarryOut, families: Sequence[type[Drive]]) -> None:
         self._carry_out = carry_out
         self._families = families
-        self._peers: list[Peer] = []  # keeps the peers alive while the C core uses them
+        self._peers: list[Peer] = []  # keeps the objects alive while the C core uses them
         self._found: set[tuple[int, Framing, int]] = set()
         self._crowded: set[tuple[int, Framing, int]] = set()
         # the largest excess, in s, of a drive's response delay over its family's usual delay
@@ -167,7 +167,7 @@ class _Scan:
         return completion
 
     def _sweep_peer(self, sweep: Sweep) -> Peer:
-        """Return a peer with a timeout that is long enough for the first characters of a reply.
+        """Return a Peer with a timeout that is long enough for the first characters of a reply.
 
         They suffice to find an address that answers. The scan then repeats the request with more time.
         """

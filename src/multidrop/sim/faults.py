@@ -289,7 +289,6 @@ class FaultyWire(Wire):
         return {sim for sim in self.drives if isinstance(sim, MotorDrive) and sim.motor.energised}
 
     def _make_noise(self, begin: float, character: float) -> None:
-        """Send noise bytes to the client and to the drives."""
         noise = self._random.randbytes(self._random.randint(1, self.faults.burst))
         self._stray.append(Transmission(noise, begin, character))
         for group in self._groups:

@@ -77,7 +77,7 @@ class ProfileDrive(MotorDrive):
             self.memory.set(register, self.memory.get(self.drive.register("reference")))
 
     def rises(self, word: int, bits: int) -> bool:
-        """Return True if this control word sets one of the bits that the previous word had at 0."""
+        """Return True if the control word sets one of these bits, and the previous word set none of them."""
         return bool(word & bits) and not self.word_before & bits
 
     def power_cycle(self) -> None:

@@ -188,7 +188,7 @@ TWENTY_MISTAKES = [
     "twenty.toml:3: [family]: unknown key 'manuel'; did you mean manual?",
     "twenty.toml:8: [family]: silence = 'soon' is not a duration from 100 us to 24 h, such as \"50 ms\", "
     '"2 s" or "1 min"',
-    "twenty.toml:6: [family]: addresses = [1, 300]: must be the first and the last address, from 1 to 247 "
+    "twenty.toml:6: [family]: addresses = [1, 300]: it must be the first and the last address, from 1 to 247 "
     "(0 to 255 on Modbus TCP); write addresses = [1, 247]",
     "twenty.toml:4: [family]: baudrates = [9600, 'fast']: 'fast' is not a baud rate; "
     "write baudrates = [9600, 19200]",
@@ -208,11 +208,11 @@ TWENTY_MISTAKES = [
     "twenty.toml:21: [reading] flags: bits: b = 99 is not a bit's number, 0 to 63",
     "twenty.toml:22: [reading] both: values and unit are both given; a register has only one of unit, values "
     "and bits",
-    "twenty.toml:25: [setting] limit: span = [50, 0] is in the wrong order: give the smallest first; "
+    "twenty.toml:25: [setting] limit: span = [50, 0]: it is in the wrong order: give the smallest first; "
     "write span = [0, 50]",
     "twenty.toml:27: [setting] speed: speed is declared twice, first in [reading] speed; "
     "every register has its own name",
-    "twenty.toml:28: [setting] gain: while_running = 'no' is neither true nor false; "
+    "twenty.toml:28: [setting] gain: while_running = 'no': it is neither true nor false; "
     "write while_running = false",
     "twenty.csv: line 2, column step: '0,1' has a decimal comma; write 0.1",
     "twenty.csv: line 2, an: at: 1E10 is a power of ten, into which a spreadsheet has converted a hex "
@@ -283,15 +283,15 @@ def test_mistakes_in_the_family_file_sections_identify_and_verb_are_reported(
 
 WRONG_KEYS = [  # each text has one wrong key of a register
     ("harmless = [0]", "[reading] a: a reading is never written"),
-    ("step = inf", "step = inf is not a finite number; write step = 0.1"),
-    ("step = 0", "step = 0 makes every value 0; write step = 0.1"),
-    ("number_format = 'F31'", "number_format = 'F31' is not known"),
+    ("step = inf", "step = inf: it is not a finite number; write step = 0.1"),
+    ("step = 0", "step = 0: it makes every value 0; write step = 0.1"),
+    ("number_format = 'F31'", "number_format = 'F31': it is not known; did you mean"),
     ("values = {}", "values is empty; leave it out"),
     (
         "title.de = 'Strom'",
-        "title = {'de': 'Strom'} has the unknown language de, not one of ru, zh; write title.ru",
+        "title = {'de': 'Strom'}: it has the unknown language de, not one of ru, zh; write title.ru",
     ),
-    ("title = 'ток'", "title = 'ток' is not a table of titles by language"),
+    ("title = 'ток'", "title = 'ток': it is not a table of titles by language"),
     ("title.ru = ''", "has a title of 0 characters, not 1 to 100"),
     ("bits = { real = 0 }", "'real' is a name that all enumerations"),
     ("bits = { On = 0, on = 1 }", "on and On differ in capitals alone"),
@@ -386,8 +386,11 @@ def test_mistake_in_a_family_file_is_reported_with_file_and_line(
             "column invalid: '7FFF' is not a number; write it as 0.1, 10 or 0x7FFF",
         ),
         (b"name,at,harmless\na,1,1E10\n", "column harmless: '1E10' is not a whole number; write 0x1E10"),
-        (b"name,at,values\na,1,off\n", "column values: 'off' is no name with its number; write off=0 | on=1"),
-        (b"name,at,title\na,1,tok\n", "column title: 'tok' is no language with its title; write ru="),
+        (
+            b"name,at,values\na,1,off\n",
+            "column values: 'off' is not of the form name=number; write off=0 | on=1",
+        ),
+        (b"name,at,title\na,1,tok\n", "column title: 'tok' is not of the form language=title; write ru="),
         (b"name,at,title\na,1,ru=a|ru=b\n", "column title: ru is given twice; give each only once"),
         (b"name,at,moves\na,1,maybe\n", "column moves: 'maybe' is neither true nor false"),
         (b'name,at\na,"1\n', "c.csv: line 2: is not CSV: "),

@@ -169,20 +169,20 @@ def counts(cell: str) -> list[int]:
 
 def named(cell: str) -> dict[str, Any]:
     """Parse "off=0 | on=1" into numbers by name. Raises ValueError with a valid example for other texts."""
-    return {name: whole(given) for name, given in _pairs(cell, "no name with its number; write off=0 | on=1")}
+    return {name: whole(given) for name, given in _pairs(cell, "name=number", "off=0 | on=1")}
 
 
 def titles(cell: str) -> dict[str, Any]:
     """Parse "ru=ток | zh=电流" into texts by language. Raises ValueError with a valid example otherwise."""
-    return dict(_pairs(cell, "no language with its title; write ru=ток | zh=电流"))
+    return dict(_pairs(cell, "language=title", "ru=ток | zh=电流"))
 
 
-def _pairs(cell: str, wrong: str) -> Iterator[tuple[str, str]]:
+def _pairs(cell: str, form: str, example: str) -> Iterator[tuple[str, str]]:
     found: set[str] = set()
     for part in cell.split("|"):
         name, equals, given = (piece.strip() for piece in part.partition("="))
         if not equals or not name or not given:
-            raise ValueError(f"{part.strip()!r} is {wrong}")
+            raise ValueError(f"{part.strip()!r} is not of the form {form}; write {example}")
         if name in found:
             raise ValueError(f"{name} is given twice; give each only once")
         found.add(name)

@@ -409,7 +409,7 @@ class Profile(Drive):
         return self._word(reverse if self._reverses(direction, status) else forward)
 
     def _word(self, count: int, role: str = "control") -> Any:
-        """Convert one of the profile's words to a value of this register."""
+        """Return a control word of the profile as a value of this register."""
         values = self.register(role).values
         assert values is not None
         return values(count)
