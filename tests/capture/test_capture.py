@@ -377,7 +377,7 @@ def test_wireshark_decodes_modbus_tcp(captured: tuple[Path, Path, list[Row]]) ->
 
 
 @pytest.mark.slow
-def test_decoding_a_capture_of_modbus_tcp_gives_the_polled_values(
+def test_a_decoded_capture_of_modbus_tcp_has_the_polled_values(
     captured: tuple[Path, Path, list[Row]],
 ) -> None:
     plant, path, polled = captured
@@ -482,9 +482,7 @@ BIG_ENDIAN_SECTION = struct.pack(">IIIHHqI", 0x0A0D0D0A, 28, 0x1A2B3C4D, 1, 0, -
         ),
     ],
 )
-def test_a_file_that_is_no_valid_capture_raises_a_one_sentence_error(
-    tmp_path: Path, content: bytes, sentence: str
-) -> None:
+def test_invalid_captures_raise_a_one_sentence_error(tmp_path: Path, content: bytes, sentence: str) -> None:
     path = tmp_path / "a.pcapng"
     path.write_bytes(content)
     with pytest.raises(CaptureError) as mistake:
@@ -515,9 +513,7 @@ def test_a_packet_that_ends_within_its_tags_is_empty(tmp_path: Path, tags: bytes
 @pytest.mark.slow
 @pytest.mark.parametrize(("content", "count"), [(READ, 33_000), (b"\xff" * 700, STREAM_ROOM // 700 + 1)])
 @pytest.mark.parametrize("format", ["pcapng", "pcap"])
-def test_a_capture_larger_than_the_decoders_buffer_is_read_whole(
-    tmp_path: Path, format: str, content: bytes, count: int
-) -> None:
+def test_large_captures_are_read_whole(tmp_path: Path, format: str, content: bytes, count: int) -> None:
     """The capture has more packets, or more bytes, than fit into the buffer between reader and decoder."""
     path = tmp_path / f"a.{format}"
     if format == "pcapng":

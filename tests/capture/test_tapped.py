@@ -210,7 +210,7 @@ def epoch(time_ns: int) -> str:
 @pytest.mark.parametrize(
     "make", [pytest.param(rough_wires, id="rough"), pytest.param(echoing_wires, id="echoing")]
 )
-def test_a_capture_of_a_disturbed_line_decodes_to_the_polled_rows(
+def test_a_disturbed_lines_capture_has_the_polled_rows(
     tmp_path: Path, make: Callable[[], list[Wire]]
 ) -> None:
     drives = [polled(drive, drive.readings()) for drive in fast_drives()]
@@ -335,7 +335,7 @@ def seconds_in(path: Path) -> list[int]:
         ]
 
 
-def test_the_flight_recorder_saves_the_traffic_around_an_anomaly(
+def test_the_recorder_saves_traffic_around_an_anomaly(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one_flight = Flight(tmp_path / "flights", monkeypatch, seconds=20)
@@ -351,9 +351,7 @@ def test_the_flight_recorder_saves_the_traffic_around_an_anomaly(
     assert b"hall-1: pump-1: bad checksum; hall-1: pump-2: fell silent\0" in path.read_bytes()[:200]
 
 
-def test_two_flight_recorders_may_write_files_in_the_same_second(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_two_recorders_may_write_in_the_same_second(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for _ in range(2):
         one_flight = Flight(tmp_path, monkeypatch)  # the clocks of both recorders start at the same time
         one_flight.pass_(10, "hall-1: pump-1: bad checksum")
@@ -364,9 +362,7 @@ def test_two_flight_recorders_may_write_files_in_the_same_second(
     ]
 
 
-def test_flight_recordings_of_a_faulty_line_do_not_fill_the_disk(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_flight_recordings_do_not_fill_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     one_flight = Flight(tmp_path, monkeypatch, seconds=20, most_files=3)
     (tmp_path / "flight-plan.pcapng").touch()  # a user's own file
     for _ in range(600):
@@ -393,9 +389,7 @@ def test_a_flight_recorder_keeps_its_limit_of_memory(tmp_path: Path, monkeypatch
     assert seconds == list(range(seconds[0], 1201))
 
 
-def test_closing_the_flight_recorder_writes_pending_anomalies(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_closing_a_recorder_writes_pending_anomalies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     one_flight = Flight(tmp_path, monkeypatch)
     one_flight.pass_(3)
     one_flight.recorder.close()

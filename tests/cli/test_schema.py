@@ -223,7 +223,7 @@ def valid_plants() -> list[str]:
 def invalid_plants() -> list[str]:
     """Return the invalid plant files of the loader's tests."""
     good = PLANTS.HEAD + PLANTS.TOY
-    rows = PLANTS.test_each_mistake_in_a_plant_file_gives_one_sentence_with_remedy.rows
+    rows = PLANTS.test_each_plant_file_mistake_gives_one_sentence.rows
     ports = (*PLANTS.UNDOCUMENTED, "tcp://bob:S3C@ET@10.0.0.7")
     texts = [
         *(text for text, _ in rows),
@@ -268,14 +268,13 @@ def test_schema_refuses_mistakes_in_the_fleet_table() -> None:
 def invalid_families() -> list[str]:
     """Return the invalid family files of the loader's tests."""
     head, reading = FAMILIES.HEAD, "[reading]\na = { at = 1 }\n"
-    texts = [text for text, _ in FAMILIES.test_mistake_in_a_family_file_is_reported_with_file_and_line.rows]
+    texts = [text for text, _ in FAMILIES.test_mistake_in_a_family_file_is_reported_with_its_line.rows]
     texts += [
-        f"{head}[text]\n{entry}\n"
-        for entry, _ in FAMILIES.test_mistakes_in_text_registers_of_a_family_file_are_reported.rows
+        f"{head}[text]\n{entry}\n" for entry, _ in FAMILIES.test_mistakes_in_text_registers_are_reported.rows
     ]
-    for rule, _ in FAMILIES.test_mistakes_in_the_parameters_section_of_a_family_file_are_reported.rows:
+    for rule, _ in FAMILIES.test_mistakes_in_the_parameters_section_are_reported.rows:
         texts.append(f"{head}{reading}[parameters]\n{rule}\n")
-    for section, _ in FAMILIES.test_mistakes_in_the_family_file_sections_identify_and_verb_are_reported.rows:
+    for section, _ in FAMILIES.test_mistakes_in_identify_and_verb_are_reported.rows:
         is_table = section.startswith("[")
         texts.append(FAMILIES.DEVICE + section if is_table else f"{section}\n{FAMILIES.DEVICE}")
     for (

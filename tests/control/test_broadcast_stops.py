@@ -140,9 +140,7 @@ def test_stop_all_broadcasts_no_command_that_is_not_a_stop(confirmed: int) -> No
 
 
 @every_broadcasting
-def test_a_broadcast_waits_for_late_replies_unless_it_is_a_stop(
-    monkeypatch: pytest.MonkeyPatch, model: str
-) -> None:
+def test_a_broadcast_awaits_late_replies_unless_a_stop(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
     line, drives, _ = line_of(model, model)
     register = drives[0].control
     insists: list[bool] = []
@@ -159,9 +157,7 @@ def test_a_broadcast_waits_for_late_replies_unless_it_is_a_stop(
 
 
 @pytest.mark.parametrize("is_sent", [False, True])
-def test_a_failed_broadcast_is_reported_as_sent_only_if_bytes_were_sent(
-    tmp_path: Path, is_sent: bool
-) -> None:
+def test_a_failed_broadcast_counts_as_sent_only_if_bytes_were_sent(tmp_path: Path, is_sent: bool) -> None:
     audit = tmp_path / "audit"
     sims = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2)]
     line = SimulatedBus(*sims, audit=audit)
@@ -237,9 +233,7 @@ def test_after_leave_stops_are_broadcast_but_setpoints_are_refused(model: str) -
 
 
 @pytest.mark.parametrize("moment", ["before it is sent", "while it waits for its turn"])
-def test_a_setpoint_broadcast_is_cancelled_by_a_later_stop(
-    monkeypatch: pytest.MonkeyPatch, moment: str
-) -> None:
+def test_a_setpoint_broadcast_is_cancelled_by_a_stop(monkeypatch: pytest.MonkeyPatch, moment: str) -> None:
     line, drives, _ = line_of("invt-che", "invt-che")
     line.sleep(60)  # after such a silence, the bus checks the identities again
     carry_out, begun = line.carry_out, len(line.frames)

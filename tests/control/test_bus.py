@@ -393,9 +393,7 @@ def test_a_wrong_confirmation_confirms_nothing(wrong: str) -> None:
         (YD1000(1, baudrate=1200), 500, 500),
     ],
 )
-def test_the_shortest_and_longest_timeout_of_a_drive_follow_its_manual(
-    drive: Drive, least_ms: int, most_ms: int
-) -> None:
+def test_the_timeouts_of_a_drive_follow_its_manual(drive: Drive, least_ms: int, most_ms: int) -> None:
     with unpaced(simulated(drive)) as sim, Bus(path(sim)) as bus:
         known = bus.peer(bus.attach(drive)).c
     assert (known.least_timeout_ns, known.most_timeout_ns) == (least_ms * 1_000_000, most_ms * 1_000_000)

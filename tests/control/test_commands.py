@@ -156,9 +156,7 @@ class Motors:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("failure", [RuntimeError("can't start new thread"), MemoryError()])
-async def test_without_threads_every_motor_gets_a_stop_before_one_is_repeated(
-    threads: Threads, failure: Exception
-) -> None:
+async def test_without_threads_no_stop_is_repeated_before_all(threads: Threads, failure: Exception) -> None:
     threads.threads, threads.failure = 1, failure
     motors = Motors(a=1, b=3, c=2)
     assert await motors.stop_all() == {"a": STANDS, "b": STANDS, "c": STANDS}
@@ -186,9 +184,7 @@ def test_stops_without_threads_do_not_block_the_event_loop(threads: Threads) -> 
     assert turns > 2
 
 
-async def test_a_stop_without_effect_ends_with_the_outcome_unknown(
-    threads: Threads, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_stop_without_effect_ends_unknown(threads: Threads, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(commands, "STOP_S", 0.0)
     motors = Motors(a=1000)
     assert await motors.stop_all() == {"a": UNKNOWN}

@@ -68,9 +68,7 @@ def test_reading_the_audit_log_skips_lines_that_are_not_records(tmp_path: Path) 
     assert [record["write"] for record in read_audit(path)] == ["a", "b"]
 
 
-def test_closing_a_bus_waits_for_an_audit_record_of_another_thread(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_closing_a_bus_waits_for_audit_records(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Otherwise a stop that ends while its bus is closed would not be recorded."""
     begun, go_on = threading.Event(), threading.Event()
 
@@ -113,9 +111,7 @@ def _is_record(line: bytes) -> bool:
     return True
 
 
-def test_a_stop_is_sent_despite_a_full_disk_and_later_records_are_written(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_stops_are_sent_despite_a_full_disk(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = tmp_path / "audit.jsonl"
     line, drive, sim = one(InvtCHE(1, maximum_frequency=50), audit=path)
     drive.set_frequency(20)
@@ -182,9 +178,7 @@ def test_an_interrupted_stop_is_recorded_as_sent_but_unknown(tmp_path: Path) -> 
     assert ended["why"].endswith("its caller was interrupted")
 
 
-def test_a_stop_has_two_audit_records_however_often_it_is_sent(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_a_repeated_stop_has_two_audit_records(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The first record is written before the first frame is sent, so it survives a kill of the process."""
     path = tmp_path / "audit.jsonl"
     line = SimulatedBus(*(simulated(InvtCHE(address)) for address in (1, 2)), audit=path)
@@ -224,9 +218,7 @@ def test_a_stop_has_two_audit_records_however_often_it_is_sent(
     }
 
 
-def test_opening_the_audit_log_on_a_hung_disk_times_out(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_an_audit_log_on_a_hung_disk_times_out(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     answers = threading.Event()
     monkeypatch.setattr(write_records, "OPENING_S", 0.05)
     monkeypatch.setattr(Path, "open", lambda *details, **options: answers.wait(PATIENCE_S))
@@ -319,9 +311,7 @@ def test_setting_the_clock_back_does_not_restore_the_yearly_eeprom_budget(tmp_pa
 
 
 @pytest.mark.long
-def test_a_setpoint_loop_writes_once_a_minute_despite_a_clock_set_back(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_a_clock_set_back_keeps_one_write_a_minute(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The EEPROM is written at most once a minute, and once more when the clock jumps back."""
     log = tmp_path / "audit.jsonl"
     line, drive, sim = one(DelixiModbus(1), audit=log)

@@ -74,9 +74,7 @@ def test_a_second_signal_is_delayed_until_all_stops_have_ended(caught: list[int]
 
 
 @BOTH
-def test_a_signal_while_one_bus_closes_starts_the_stops_of_other_buses(
-    caught: list[int], number: int
-) -> None:
+def test_a_signal_while_a_bus_closes_starts_the_stops_of_other_buses(caught: list[int], number: int) -> None:
     hook, acts = ExitHook(), [Act(), Act()]
     made = [hook.add(act.begin, act.work) for act in acts]
     timer = threading.Thread(target=lambda: (acts[0].works.wait(PATIENCE), signal.raise_signal(number)))
@@ -127,9 +125,7 @@ def test_a_third_signal_within_a_second_ends_the_wait_for_stops(
     assert len(caught) == 1
 
 
-def test_a_third_signal_ends_the_wait_even_if_stderr_is_closed(
-    caught: list[int], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_third_signal_needs_no_standard_error(caught: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
     """Standard error may be closed, or its terminal may be gone."""
 
     def write(fd: int, data: bytes) -> int:
@@ -182,9 +178,7 @@ def exit_threads() -> set[threading.Thread]:
     return {thread for thread in threading.enumerate() if thread.name == "multidrop exit"}
 
 
-def test_a_failing_action_at_exit_does_not_delay_other_actions(
-    caught: list[int], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_failing_action_at_exit_is_logged(caught: list[int], caplog: pytest.LogCaptureFixture) -> None:
     def fail() -> None:
         raise ZeroDivisionError
 
@@ -206,9 +200,7 @@ def test_an_action_at_exit_may_be_finished_on_any_thread(caught: list[int]) -> N
     assert caught == [signal.SIGTERM]
 
 
-def test_a_bus_opened_while_the_last_one_closes_still_handles_signals(
-    caught: list[int], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_buses_opened_during_a_close_get_signals(caught: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
     """Otherwise SIGTERM would end the process and leave the new bus's motors running."""
     hook, acts = ExitHook(), [Act(), Act()]
     first, let_go = hook.add(acts[0].begin, acts[0].work), hook._let_go
@@ -389,9 +381,7 @@ def test_a_delayed_signal_is_forwarded_only_once(caught: list[int], monkeypatch:
     signal.raise_signal(sent[-1])
 
 
-def test_a_signal_immediately_prints_which_drives_are_being_stopped(
-    caught: list[int], capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_signal_prints_the_stopped_drives(caught: list[int], capfd: pytest.CaptureFixture[str]) -> None:
     hook, acts = ExitHook(), [Act(), Act()]
     names = [["pump"], [f"fan-{number}" for number in range(25)]]
     for act, drives in zip(acts, names, strict=True):
@@ -580,9 +570,7 @@ def test_a_poller_restores_the_handlers_that_its_bus_replaced(caught: list[int],
     assert signal.getsignal(signal.SIGTERM) == before
 
 
-def test_sigterm_stops_drives_before_a_handler_runs_that_was_installed_between_pollers(
-    caught: list[int],
-) -> None:
+def test_sigterm_stops_drives_before_a_handler_installed_between_pollers_runs(caught: list[int]) -> None:
     """The program's own SIGTERM handler, installed between two pollers, runs once the motor has stopped."""
     drive = InvtCHE(1, maximum_frequency=50, name="pump")
     energised: list[bool] = []

@@ -92,9 +92,7 @@ def test_a_drive_replaced_while_its_write_is_counted_is_not_written(monkeypatch:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("model", MAKE)
-def test_a_silent_drive_is_identified_once_before_the_next_write(
-    model: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_silent_drive_is_identified_before_a_write(model: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(records, "LEAST_INTERVAL", 0.0)  # s between two EEPROM writes of one register
     with known(model) as (bus, drive, received):
         looks: list[str] = []
@@ -111,9 +109,7 @@ def test_a_silent_drive_is_identified_once_before_the_next_write(
 @pytest.mark.parametrize("model", MAKE)
 @pytest.mark.usefixtures("_patient")
 @pytest.mark.parametrize("pause", ["idle", "asleep", "read since"])
-def test_a_drive_is_identified_once_after_ten_seconds_without_a_reply(
-    model: str, pause: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_drive_is_identified_after_10_s(model: str, pause: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(records, "LEAST_INTERVAL", 0.0)
     with known(model) as (bus, drive, _received):
         drive.set_frequency(10)
@@ -136,9 +132,7 @@ def test_a_drive_is_identified_once_after_ten_seconds_without_a_reply(
 @pytest.mark.usefixtures("_turns_awaited")
 @pytest.mark.parametrize("model", MAKE)
 @pytest.mark.parametrize("is_silent", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_a_stop_after_an_idle_or_silent_time_is_sent_without_reading_first(
-    model: str, is_silent: bool
-) -> None:
+def test_a_stop_after_an_idle_or_silent_time_is_sent_without_a_read(model: str, is_silent: bool) -> None:
     with known(model) as (bus, drive, received):
         drive.set_frequency(10)
         drive.start()
@@ -294,9 +288,7 @@ class Mute(Drive):
 
 
 @pytest.mark.parametrize("is_lost", [False, True])
-def test_one_register_is_read_before_the_first_stop_without_waiting(
-    monkeypatch: pytest.MonkeyPatch, is_lost: bool
-) -> None:
+def test_a_first_stop_follows_a_read_without_waiting(monkeypatch: pytest.MonkeyPatch, is_lost: bool) -> None:
     """The read shows whether the adapter echoes, before an echo could pass for the drive's confirmation."""
     bus = SimulatedBus(simulated(Mute(1)))
     drive, carry_out = bus.attach(Mute(1)), bus.carry_out
@@ -395,9 +387,7 @@ def test_a_stop_is_sent_after_an_exception_to_the_identity_check(model: str, cod
 
 
 @table("model", MAKE)
-def test_a_stop_and_its_identity_check_do_not_wait_for_late_replies(
-    monkeypatch: pytest.MonkeyPatch, model: str
-) -> None:
+def test_a_stop_and_its_check_await_no_late_reply(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
     line, drive, _ = one(MAKE[model](1))
     insisted: list[bool] = []
     carry_out = line.carry_out
@@ -462,9 +452,7 @@ OTHERS: Sequence[tuple[Drive, Drive]] = (  # (declared drive, drive on the line)
 
 
 @table("pair", OTHERS)
-def test_the_error_of_a_withheld_stop_names_the_command_for_the_other_family(
-    pair: tuple[Drive, Drive],
-) -> None:
+def test_the_error_of_a_withheld_stop_names_the_other_familys_command(pair: tuple[Drive, Drive]) -> None:
     declared, there = pair
     sim = simulated(there)
     line = SimulatedBus(sim)
@@ -503,9 +491,7 @@ def shows(line: SimulatedBus, drive: Drive, name: str, count: int) -> None:
 
 @table(("model", "name", "count"), UNEXPECTED_COUNTS)
 @table("how", ["stop", "stop_all", "write"])
-def test_one_unexpected_value_prevents_a_start_but_no_stop(
-    model: str, name: str, count: int, how: str
-) -> None:
+def test_one_odd_value_prevents_a_start_but_no_stop(model: str, name: str, count: int, how: str) -> None:
     line, drive, _ = one(MAKE[model](1))
     shows(line, drive, name, count)
     with pytest.raises(WriteForbidden):

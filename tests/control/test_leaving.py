@@ -62,9 +62,7 @@ def test_leave_sends_no_stop_by_default(pair: RunningPair) -> None:
     assert pair.line.frames == []
 
 
-def test_detached_drives_are_stopped_with_stop_on_exit(
-    pair: RunningPair, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_stop_on_exit_stops_detached_drives(pair: RunningPair, caplog: pytest.LogCaptureFixture) -> None:
     first, second = pair.drives
     begun = [drive.begin_call("start", drive.stops_called[0]) for drive in pair.drives]
     pair.bus.part_with([first], [first])
@@ -110,9 +108,7 @@ def test_a_drive_being_detached_cannot_be_started_after_its_stop(pair: RunningPa
     pair.line.answers = lambda request: None
 
 
-def test_detaching_drives_waits_for_their_stops_on_other_threads(
-    pair: RunningPair, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_detaching_drives_waits_for_their_stops(pair: RunningPair, monkeypatch: pytest.MonkeyPatch) -> None:
     waited: list[list[Any]] = []
     monkeypatch.setattr(pair.bus._latches, "await_stops", lambda *drives: waited.append([*drives]))
     pair.bus.part_with(pair.drives, [])

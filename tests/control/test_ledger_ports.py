@@ -41,9 +41,7 @@ def write(port: str, seconds: float, ledger: Ledger | None = None) -> None:
 
 
 @pytest.mark.slow
-def test_all_paths_of_a_port_share_one_eeprom_write_a_minute(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_all_paths_of_a_port_share_one_eeprom_budget(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     ledger = Ledger(tmp_path / "wear")
     (tmp_path / "ports").mkdir()
@@ -75,9 +73,7 @@ def test_all_names_of_a_host_share_one_eeprom_write_a_minute(tmp_path: Path) -> 
         assert [each.cell.port for each in ledger.wear(0)] == [path.removeprefix("socket://")]
 
 
-def test_an_adapter_is_identified_by_its_serial_number(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_adapters_are_identified_by_serial_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(port_identity, "BY_ID", tmp_path / "by-id")
     (tmp_path / "by-id").mkdir()
     for name in ("ttyUSB0", "ttyUSB1"):

@@ -124,9 +124,7 @@ CALLS: dict[str, Callable[[Scene], object]] = {
 
 
 @pytest.mark.parametrize("call", CALLS.values(), ids=CALLS)
-def test_before_the_mastership_every_call_raises_and_sends_nothing(
-    scene: Scene, call: Callable[[Scene], object]
-) -> None:
+def test_before_the_mastership_no_call_sends_anything(scene: Scene, call: Callable[[Scene], object]) -> None:
     begun = time.monotonic()
     with pytest.raises(NotMaster) as failure:
         call(scene)
@@ -141,7 +139,7 @@ def test_before_the_mastership_every_call_raises_and_sends_nothing(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("call", usually("start", *(call for call in CALLS if call != "start")))
-def test_after_the_mastership_every_call_raises_and_sends_nothing(scene: Scene, call: str) -> None:
+def test_after_the_mastership_no_call_sends_anything(scene: Scene, call: str) -> None:
     scene.become_master()
     scene.drive.read(Toy.output_current)
     before = scene.requests
@@ -182,9 +180,7 @@ def test_a_mastership_whose_deadline_has_passed_sends_nothing(scene: Scene) -> N
         assert scene.requests <= sent
 
 
-def test_the_error_of_an_unsent_stop_says_that_the_motor_continues(
-    scene: Scene, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_an_unsent_stops_error_says_the_motor_runs_on(scene: Scene, caplog: pytest.LogCaptureFixture) -> None:
     port = scene.bus.line.port
     sentence = (
         "pump: the stop was NOT sent, and the motor continues as it is: this process is not the master of "
@@ -256,9 +252,7 @@ def test_a_partly_sent_write_is_unconfirmed(scene: Scene, monkeypatch: pytest.Mo
 
 
 @pytest.mark.slow
-def test_a_script_that_loses_mastership_at_its_second_write_raises_not_master(
-    scene: Scene, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_losing_mastership_at_the_second_write_raises(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """The first write is done and recorded; the second write was not sent."""
     scene.become_master()
     hold_back(monkeypatch, scene, sent_ns=0, after=1)
@@ -272,9 +266,7 @@ def test_a_script_that_loses_mastership_at_its_second_write_raises_not_master(
     assert len([*read_audit(scene.audit)]) == 1
 
 
-def test_a_sent_stop_is_unconfirmed_if_the_mastership_ends(
-    scene: Scene, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_sent_stop_is_unconfirmed_if_mastership_ends(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """The stop was sent, so it is not reported as unsent."""
     scene.become_master()
     carry_out = scene.bus.line.carry_out

@@ -166,9 +166,7 @@ def test_no_read_is_sent_for_an_expired_write() -> None:
     assert line.frames == []
 
 
-def test_the_drives_watchdog_setting_is_logged_at_the_first_identity_check(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_the_watchdog_is_logged_at_the_first_identity_check(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "multidrop.control")
     line, drive, _ = one(InvtCHE(1, maximum_frequency=50))
     drive.stop()
@@ -412,9 +410,7 @@ def test_after_a_lost_reply_the_setpoint_is_unknown_and_a_start_is_refused(make:
     assert bus.written == []
 
 
-def test_the_known_setpoint_is_forgotten_if_the_drive_keeps_another_value(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_setpoint_is_forgotten_if_the_drive_keeps_another_value(monkeypatch: pytest.MonkeyPatch) -> None:
     _, drive, sim = one(ErmanERG220(1))
     drive.set_frequency(20)
     take = type(sim).answer
@@ -431,9 +427,7 @@ def test_the_known_setpoint_is_forgotten_if_the_drive_keeps_another_value(
     assert drive.commanded is None
 
 
-def test_a_setpoint_that_eeprom_already_holds_becomes_known_without_a_write(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_setpoint_already_in_eeprom_becomes_known_without_a_write(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(records, "LEAST_INTERVAL", 0.0)
     bus, drive, _ = one(DelixiModbus(1))
     drive.set_frequency(20)

@@ -164,9 +164,7 @@ def test_drives_waiting_for_a_staggered_start_are_read_regularly(gap: float) -> 
     assert 4 * gap <= line.seconds - begun < 4 * gap + 10
 
 
-def test_no_drive_is_started_after_a_suspension_between_staggered_starts(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_no_start_follows_a_suspension_between_staggered_starts(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drives, sims = che_drives(2)
 
     def sleep(seconds: float) -> None:
@@ -204,9 +202,7 @@ def test_a_failed_staggered_start_sends_no_stop_to_a_drive_of_unknown_identity()
     assert {request.address for request, _ in line.frames if is_write(request)} == {1}
 
 
-def test_a_drive_that_leaves_its_bus_during_a_staggered_start_leaves_no_motor_running(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_detaching_a_drive_during_staggered_starts_stops_all_motors(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drives, sims = che_drives(2)
     line.frames.clear()
 
@@ -277,9 +273,7 @@ class NoThread(threading.Thread):
         raise RuntimeError("can't start new thread")
 
 
-def test_without_threads_all_started_drives_get_a_stop_before_any_wait(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_without_threads_all_started_drives_get_a_stop_before_a_wait(monkeypatch: pytest.MonkeyPatch) -> None:
     _, drives, sims = che_drives(2)
     sims[1].trip(4)
     noted = NotedCalls(drives)

@@ -91,9 +91,7 @@ def test_a_plain_write_may_stop_the_motor() -> None:
         (ErmanERG220(1), "minimum_frequency", 50.1, r"above maximum_frequency"),
     ],
 )
-def test_a_write_that_its_register_does_not_allow_is_not_sent(
-    drive: Drive, name: str, value: float, sentence: str
-) -> None:
+def test_a_write_that_is_forbidden_is_not_sent(drive: Drive, name: str, value: float, sentence: str) -> None:
     line, _, _ = one(drive)
     register = drive.register(name)
     with pytest.raises(WriteForbidden, match=sentence) as refusal:
@@ -128,9 +126,7 @@ def test_a_raw_request_bypasses_all_rules_and_errors_name_it_as_raw() -> None:
 
 
 @every_family
-def test_only_the_first_write_is_preceded_by_an_identity_check(
-    monkeypatch: pytest.MonkeyPatch, model: str
-) -> None:
+def test_only_the_first_write_follows_an_identity_check(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
     monkeypatch.setattr(records, "LEAST_INTERVAL", 0.0)  # s between writes of one register to an EEPROM
     line, drive, _ = one(MAKE[model](1))
     drive.set_frequency(20)
@@ -255,9 +251,7 @@ class Tidy(Drive):
 
 
 @pytest.mark.parametrize("result", [Failure.EXPIRED, Failure.NOT_MASTER])
-def test_an_unsent_write_is_not_reported_as_unconfirmed(
-    monkeypatch: pytest.MonkeyPatch, result: Failure
-) -> None:
+def test_an_unsent_write_is_not_called_unconfirmed(monkeypatch: pytest.MonkeyPatch, result: Failure) -> None:
     """The write is not reported as unconfirmed even if a later read of the script fails."""
     line = SimulatedBus(simulated(Tidy(1)))
     drive = line.attach(Tidy(1, confirmed=1))
@@ -355,9 +349,7 @@ def test_a_start_is_refused_if_another_client_changed_the_setpoint() -> None:
     assert not sim.motor.energised
 
 
-def test_a_setpoint_that_the_drive_limits_is_reported_with_the_limited_value(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_setpoint_that_the_drive_limits_raises_not_verified(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, sim = one(ErmanERG220(1))
     accept = type(sim).accept
     monkeypatch.setattr(

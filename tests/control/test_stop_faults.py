@@ -158,9 +158,7 @@ def fails_to_start_the_last(line: SimulatedBus, drives: list[Any], sims: list[An
 
 
 @pytest.mark.long
-def test_an_interrupted_stop_after_a_failed_staggered_start_stops_all(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_an_interrupted_stop_of_a_failed_staggered_start_stops_all(monkeypatch: pytest.MonkeyPatch) -> None:
     class OwnThread(threading.Thread):
         """A thread that does its work in `start`."""
 
@@ -183,9 +181,7 @@ def test_an_interrupted_stop_after_a_failed_staggered_start_stops_all(
         assert not any(sim.motor.goal for sim in sims), nth
 
 
-def test_a_failed_staggered_start_stops_all_drives_although_one_stop_raises(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_failed_staggered_start_stops_all_even_if_one_stop_raises(monkeypatch: pytest.MonkeyPatch) -> None:
     class NoThread(threading.Thread):
         def start(self) -> None:
             raise MemoryError
@@ -261,9 +257,7 @@ def test_a_stop_is_created_as_soon_as_the_system_has_memory_and_descriptors(
     assert not sims[0].motor.energised
 
 
-def test_a_stop_that_cannot_be_created_raises_memory_error_after_30_s(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_stop_that_cannot_be_made_raises_memory_error_after_30_s(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drives, _ = che_drives(runs_s=10)
     begun, before = line.seconds, len(line.written)
     NoRoom(monkeypatch, 1000, NO_MEMORY)
@@ -273,9 +267,7 @@ def test_a_stop_that_cannot_be_created_raises_memory_error_after_30_s(
     assert len(line.written) == before
 
 
-def test_the_error_of_a_stop_without_system_resources_names_the_reason(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_error_of_a_stop_without_resources_names_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     line, _, _ = che_drives(runs_s=10)
 
     def failing(exchange: Exchange, **details: Any) -> Completion:
@@ -339,9 +331,7 @@ def test_a_repeated_stop_tries_to_open_a_locked_ledger_only_once(
     assert sum(wear.writes for wear in ledger.wear(1.8e9)) == len(line.written) - before > 40
 
 
-def test_a_stop_is_sent_although_the_port_name_is_not_text(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_stop_is_sent_if_the_port_name_is_not_text(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     line = SimulatedBus(simulated(Fan(1)), ledger=tmp_path / "wear")
     line.identity = "/dev/tty\udcff"
     line.attach(Fan(1)).stop()

@@ -150,9 +150,7 @@ def test_no_call_moves_a_motor_after_the_bus_is_closed() -> None:
 
 @every_family
 @pytest.mark.parametrize("seconds", [None, 12.0])
-def test_the_stop_of_a_silent_drive_leaves_other_drives_more_than_half_of_the_lines_time(
-    model: str, seconds: float | None
-) -> None:
+def test_a_silent_drives_stop_leaves_half_of_the_line_to_others(model: str, seconds: float | None) -> None:
     """Only the first frames of the stop are sent without delay. The total time of the stop stays the same."""
     line, drive, _ = one(MAKE[model](1))
     line.bus.check_identity(drive)
@@ -202,9 +200,7 @@ SENSELESS = [-1, float("nan"), float("-inf"), Decimal("sNaN"), True, "5", [5], 5
 
 @pytest.mark.parametrize("seconds", SENSELESS, ids=map(repr, SENSELESS))
 @pytest.mark.parametrize("stops", ["stop", "coast", "stop_all"])
-def test_an_invalid_stop_time_is_ignored_with_a_warning(
-    caplog: pytest.LogCaptureFixture, stops: str, seconds: Any
-) -> None:
+def test_an_invalid_stop_time_is_ignored(caplog: pytest.LogCaptureFixture, stops: str, seconds: Any) -> None:
     line, (drive,), (sim,) = che_drives(hz=50, runs_s=20)
     deaf_until = line.seconds + LEAST_S - 5
     line.deafens = lambda request: line.seconds < deaf_until
@@ -396,9 +392,7 @@ def test_a_stop_on_a_closed_port_raises_immediately() -> None:
     assert line.seconds - begun < 0.1
 
 
-def test_a_stop_is_sent_although_the_ledger_cannot_be_written(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_stop_is_sent_without_a_writable_ledger(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     (tmp_path / "file").write_text("")
     line = SimulatedBus(simulated(Own(1)), simulated(Own(2)), ledger=tmp_path / "file" / "wear")
     drives = [line.attach(Own(address)) for address in (1, 2)]

@@ -67,9 +67,7 @@ def test_a_call_delayed_past_its_time_limit_raises_expired(line: SimulatedBus, s
 
 
 @pytest.mark.parametrize("slept_before", [0, 3600])
-def test_a_time_limit_counts_the_computers_sleep_only_within_its_block(
-    line: SimulatedBus, slept_before: float
-) -> None:
+def test_a_time_limit_counts_sleep_only_within_its_block(line: SimulatedBus, slept_before: float) -> None:
     line.slept += slept_before
     before = len(written(line))
     with within(line, 0.5):
@@ -101,9 +99,7 @@ class Slow(Drive):
 
 
 @pytest.mark.parametrize(("before", "between", "sent"), [(0.1, 0.1, 2), (0.1, 5.0, 2), (0.9, 0.1, 0)])
-def test_no_verb_starts_after_the_time_limit_but_a_started_verb_continues(
-    before: float, between: float, sent: int
-) -> None:
+def test_only_the_start_of_a_verb_has_a_time_limit(before: float, between: float, sent: int) -> None:
     """Unlike the limit, the bus's own expiry does not count the time that a script waits."""
     line = SimulatedBus(simulated(Slow(1)))
     drive = line.bus.attach(Slow(1, confirmed=1))

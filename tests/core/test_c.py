@@ -53,17 +53,13 @@ def test_utc_offset_is_read_for_each_batch_of_rows(build: Callable[..., None]) -
 @pytest.mark.parametrize(
     "sanitizers", usually([*SANITIZERS], ["-fsanitize=thread"]), ids=["memory", "threads"]
 )
-def test_threads_can_open_and_close_ports_concurrently(
-    build: Callable[..., None], sanitizers: list[str]
-) -> None:
+def test_threads_can_open_and_close_ports(build: Callable[..., None], sanitizers: list[str]) -> None:
     build("test_engine", *core_without(), sanitizers=sanitizers)
 
 
 @pytest.mark.slow
 @WAITS_BY_EPOLL
-def test_a_call_within_the_silence_after_an_exchange_does_not_wake_the_thread(
-    build: Callable[..., None],
-) -> None:
+def test_a_call_in_the_silence_after_an_exchange_does_not_wake_the_thread(build: Callable[..., None]) -> None:
     build("test_wakings", *core_without("wakeup"))
 
 

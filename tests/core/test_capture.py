@@ -67,9 +67,7 @@ def test_a_printed_exchange_is_split_into_a_request_and_its_reply(reply: Printed
 
 
 @given(st.lists(st.sampled_from(REPLIES), max_size=30), st.data())
-def test_the_same_frames_are_found_if_their_bytes_arrive_in_any_pieces(
-    line: list[Printed], data: st.DataObject
-) -> None:
+def test_the_same_frames_are_found_in_any_pieces(line: list[Printed], data: st.DataObject) -> None:
     bytes_ = READ + ANSWER + b"".join(each.request_frame + each.frame for each in line)
     stream, splitter, spans = Stream(), Splitter(), []
     at = 0

@@ -358,9 +358,7 @@ def test_the_greatest_code_of_a_column_is_found(given_codes: list[int]) -> None:
 
 
 @given(st.lists(st.tuples(codes, codes) | st.just((7, 65535))), st.frozensets(st.tuples(codes, codes)))
-def test_rows_are_found_by_their_codes(
-    rows: list[tuple[int, int]], others: frozenset[tuple[int, int]]
-) -> None:
+def test_rows_are_found_by_code(rows: list[tuple[int, int]], others: frozenset[tuple[int, int]]) -> None:
     wanted = frozenset({(7, 65535), *rows[::3], *others})
     drives, registers = (memoryview(array("H", [row[side] for row in rows])) for side in (0, 1))
     assert find_codes(drives, registers, wanted) == [at for at, row in enumerate(rows) if row in wanted]

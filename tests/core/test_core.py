@@ -382,9 +382,7 @@ def test_an_unreferenced_port_is_closed() -> None:
 
 
 @pytest.mark.parametrize("way", ["queued", "repeated", "urgent"])
-def test_an_echo_probe_is_sent_first_if_it_is_unknown_whether_the_adapter_echoes(
-    drive: Drive, way: str
-) -> None:
+def test_an_echo_probe_is_sent_first_if_the_adapter_may_echo(drive: Drive, way: str) -> None:
     requested: list[int] = []
     with closing(Port(drive(noting(requested)), NO_SETTINGS)) as port:
         rows, asked = Rows(port), [read(7, echo_probe=read(99))]
@@ -610,9 +608,7 @@ def wait_until_it_sleeps(thread: threading.Thread) -> None:
 
 
 @pytest.mark.parametrize("insists", [False, True], ids=["reads", "stops"])
-def test_polling_keeps_a_share_of_the_line_during_urgent_exchanges_but_not_during_stops(
-    drive: Drive, insists: bool
-) -> None:
+def test_polling_keeps_a_share_of_the_line_except_during_stops(drive: Drive, insists: bool) -> None:
     """Between urgent exchanges, polling gets one exchange at a time, and never two in a row."""
     asked: list[str] = []
     go_on = threading.Event()

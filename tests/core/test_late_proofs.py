@@ -39,9 +39,7 @@ def is_barred(line: LineDriver, drive: Peer, request: Message) -> bool:
 
 
 @pytest.mark.usefixtures("proof")
-def test_a_read_is_not_sent_while_a_late_reply_could_pass_for_its_reply(
-    line: LineDriver, drive: Peer
-) -> None:
+def test_no_read_is_sent_while_a_late_reply_could_pass_for_its_reply(line: LineDriver, drive: Peer) -> None:
     assert is_barred(line, drive, OTHER)
     ask(line, drive, Message(1, 4, 50, 1))  # a late reply to READ does not fit this request
 
@@ -54,9 +52,7 @@ def test_a_write_waits_for_the_reply_to_an_earlier_write(line: LineDriver, drive
 
 
 @pytest.mark.parametrize("late", [0, 1])
-def test_after_the_reply_to_a_proof_no_late_reply_is_expected(
-    line: LineDriver, drive: Peer, proof: Exchange, late: int
-) -> None:
+def test_an_answered_proof_ends_the_wait(line: LineDriver, drive: Peer, proof: Exchange, late: int) -> None:
     line.send(proof)
     for _ in range(late):  # a late reply before that of the proof is skipped
         line.receive(reply(1111))
@@ -67,9 +63,7 @@ def test_after_the_reply_to_a_proof_no_late_reply_is_expected(
     assert line.data_after(reply(2222)) == words(2222)
 
 
-def test_after_an_unanswered_proof_the_late_reply_is_still_expected(
-    line: LineDriver, drive: Peer, proof: Exchange
-) -> None:
+def test_an_unanswered_proof_leaves_a_late_reply_due(line: LineDriver, drive: Peer, proof: Exchange) -> None:
     line.send(proof)
     line.wait_until_done()
     assert line.completion.result == Failure.NO_REPLY
@@ -89,9 +83,7 @@ def ask_in_vain(line: LineDriver, drive: Peer, proof: Exchange) -> None:
     line.now = drive.late_until_ns + MS
 
 
-def test_a_proof_that_the_drive_never_answers_is_no_longer_sent(
-    line: LineDriver, drive: Peer, proof: Exchange
-) -> None:
+def test_a_proof_that_is_never_answered_is_dropped(line: LineDriver, drive: Peer, proof: Exchange) -> None:
     """Some devices do not reply to reads of registers that they do not have."""
     ask_in_vain(line, drive, proof)
     assert is_barred(line, drive, OTHER)
@@ -100,9 +92,7 @@ def test_a_proof_that_the_drive_never_answers_is_no_longer_sent(
 
 
 @pytest.mark.parametrize("is_late", [True, False])
-def test_a_proof_that_was_answered_once_is_always_kept(
-    line: LineDriver, drive: Peer, proof: Exchange, is_late: bool
-) -> None:
+def test_a_proof_answered_once_is_kept(line: LineDriver, drive: Peer, proof: Exchange, is_late: bool) -> None:
     if is_late:
         ask_in_vain(line, drive, proof)
     else:
@@ -113,9 +103,7 @@ def test_a_proof_that_was_answered_once_is_always_kept(
     assert is_barred(line, drive, OTHER)
 
 
-def test_a_drive_that_answers_no_request_keeps_its_proofs(
-    line: LineDriver, drive: Peer, proof: Exchange
-) -> None:
+def test_a_drive_that_never_answers_keeps_its_proofs(line: LineDriver, drive: Peer, proof: Exchange) -> None:
     for _ in range(3):
         line.send(proof)
         line.wait_until_done()
@@ -155,9 +143,7 @@ def test_a_late_reply_is_counted_once(line: LineDriver, drive: Peer) -> None:
 
 
 @pytest.mark.usefixtures("proof")
-def test_a_reply_is_found_after_a_late_reply_that_came_during_its_request(
-    line: LineDriver, drive: Peer
-) -> None:
+def test_a_reply_is_found_after_a_late_reply_during_its_request(line: LineDriver, drive: Peer) -> None:
     """The port accepts the request in two parts, and the late reply arrives between them."""
     line.begin(exchange(Message(1, 4, 50, 1), drive))
     while line.want != "write":
@@ -203,7 +189,7 @@ def test_a_reply_is_in_doubt_if_it_may_answer_another_request(line: LineDriver, 
 
 
 @pytest.mark.usefixtures("proof")
-def test_no_reply_is_in_doubt_after_the_reply_to_a_proof(
+def test_no_reply_is_in_doubt_once_a_proof_is_answered(
     line: LineDriver, drive: Peer, proof: Exchange
 ) -> None:
     line.send(proof)
@@ -227,9 +213,7 @@ def is_in_doubt(line: LineDriver) -> bool:
     return line.want == "done" and line.completion.result == Failure.LATE_ANSWER_DUE
 
 
-def test_the_first_reply_is_in_doubt_until_a_proof_is_answered(
-    line: LineDriver, drive: Peer, first: Exchange
-) -> None:
+def test_a_proof_ends_the_doubt_about_the_first_reply(line: LineDriver, drive: Peer, first: Exchange) -> None:
     ask(line, drive, READ)
     line.receive(reply(7777))  # the reply to the other process
     assert is_in_doubt(line)
@@ -242,9 +226,7 @@ def test_the_first_reply_is_in_doubt_until_a_proof_is_answered(
     assert drive.counters().late == 0  # this drive has answered each request in time
 
 
-def test_after_an_exception_the_first_reply_is_still_in_doubt(
-    line: LineDriver, drive: Peer, first: Exchange
-) -> None:
+def test_an_exception_leaves_the_first_reply_in_doubt(line: LineDriver, drive: Peer, first: Exchange) -> None:
     ask(line, drive, READ)
     line.receive(build_reply(Framing.RTU, Message(1, 3, exception=2)))
     assert (line.want, line.completion.reply.exception) == ("done", 2)

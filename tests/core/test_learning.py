@@ -87,9 +87,7 @@ def test_the_port_is_first_read_shortly_before_the_replys_end(line: LineDriver, 
         assert looks(line, drive, 15 * MS)[1] == looks(line, drive, 16 * MS)[1] == 0
 
 
-def test_the_wait_for_the_rest_of_a_reply_depends_on_the_missing_length(
-    line: LineDriver, drive: Peer
-) -> None:
+def test_the_wait_for_the_rest_of_a_reply_depends_on_its_length(line: LineDriver, drive: Peer) -> None:
     ask(line, drive)
     line.now += 60 * MS
     line.receive(reply()[:3])
@@ -189,9 +187,7 @@ def gathered(line: LineDriver, drive: Peer, request: Message = READ) -> None:
 
 
 @pytest.mark.parametrize("asked", [READ, LONG], ids=["short", "long"])
-def test_the_wait_for_a_reply_that_does_not_start_excludes_its_length(
-    line: LineDriver, drive: Peer, asked: Message
-) -> None:
+def test_the_wait_for_no_reply_excludes_its_length(line: LineDriver, drive: Peer, asked: Message) -> None:
     answer(line, drive, 2 * MS)
     assert given_up(line, drive, asked) == LEAST + AWAITED
 
@@ -255,9 +251,7 @@ def test_a_reply_after_a_shortened_wait_is_recognised_as_late(line: LineDriver, 
 # ---- late replies ----
 
 
-def test_no_request_is_sent_whose_reply_could_be_mistaken_for_a_late_reply(
-    line: LineDriver, drive: Peer
-) -> None:
+def test_no_request_is_sent_while_a_late_reply_could_pass_for_its_own(line: LineDriver, drive: Peer) -> None:
     time_out(line, drive)
     line.begin(exchange(OTHER, drive))
     assert line.want == "done"
@@ -277,9 +271,7 @@ def test_a_late_reply_is_expected_after_a_lost_port_is_reopened(line: LineDriver
 
 
 @pytest.mark.parametrize("is_row", [True, False], ids=["for a row", "for a client"])
-def test_a_polled_value_that_may_be_late_has_the_time_of_the_earlier_request(
-    line: LineDriver, drive: Peer, is_row: bool
-) -> None:
+def test_a_polled_value_in_doubt_has_the_earlier_time(line: LineDriver, drive: Peer, is_row: bool) -> None:
     """A read by `Bus` gets no value until a proof has shown that no late reply is due."""
     drive.prove_by([exchange(LONGER, drive), exchange(Message(1, 3, 0, 3), drive)])
     rows = RowLayout(0, [Field(0, NumberFormat.U16, 0, 1.0, 1.0)]) if is_row else None
@@ -302,9 +294,7 @@ def test_a_polled_value_that_may_be_late_has_the_time_of_the_earlier_request(
 
 
 @pytest.mark.parametrize(("asked", "times"), [(READ, 2), (WRITE, 1)], ids=["a read", "a write"])
-def test_a_read_but_no_write_is_repeated_if_the_reply_may_be_to_another(
-    drive: Peer, asked: Message, times: int
-) -> None:
+def test_only_reads_are_repeated_if_the_reply_is_in_doubt(drive: Peer, asked: Message, times: int) -> None:
     """The reply may be to an earlier request. A write is not repeated: it may have started a motor."""
     slots, turn = ffi.new("struct md_slot[]", 1), ffi.new("struct md_turn *")
     wake, found = ffi.new("int64_t *"), ffi.new("struct md_completion *")
@@ -328,9 +318,7 @@ def test_no_late_reply_is_expected_to_an_unsent_request(line: LineDriver, drive:
     assert drive.late_until_ns == 0
 
 
-def test_a_request_is_sent_if_no_late_reply_could_be_mistaken_for_its_own(
-    line: LineDriver, drive: Peer
-) -> None:
+def test_a_request_is_sent_if_no_late_reply_could_pass_for_its_own(line: LineDriver, drive: Peer) -> None:
     """A stop is a write to which the late reply to a read does not fit."""
     time_out(line, drive)
     ask(line, drive, WRITE)
@@ -443,9 +431,7 @@ def test_no_late_reply_is_expected_after_the_longest_documented_delay(line: Line
 
 
 @pytest.mark.parametrize("piece", [7, 1], ids=["whole", "byte by byte"])
-def test_a_late_reply_is_recognised_and_ends_the_wait_for_it(
-    line: LineDriver, drive: Peer, piece: int
-) -> None:
+def test_a_late_reply_is_recognised_and_ends_the_wait(line: LineDriver, drive: Peer, piece: int) -> None:
     time_out(line, drive)
     line.receive(reply(1111), piece)
     assert drive.late_until_ns == 0
@@ -496,9 +482,7 @@ def test_late_replies_of_several_drives_are_recognised(line: LineDriver) -> None
     assert drives[2].counters().late == 1
 
 
-def test_a_late_reply_is_recognised_during_another_exchange_of_the_same_drive(
-    line: LineDriver, drive: Peer
-) -> None:
+def test_a_late_reply_is_recognised_during_the_drives_next_exchange(line: LineDriver, drive: Peer) -> None:
     time_out(line, drive)
     ask(line, drive, WRITE)
     line.receive(reply(1111))
@@ -573,9 +557,7 @@ def all_looks(
     return [looks(line, drive, delay, details) for delay in delays]
 
 
-def test_seven_of_eight_replies_for_a_waiting_caller_need_only_one_read(
-    line: LineDriver, drive: Peer
-) -> None:
+def test_seven_of_eight_replies_for_a_waiting_caller_need_one_read(line: LineDriver, drive: Peer) -> None:
     all_looks(line, drive, STEADY, FOR_A_CLIENT)
     found = all_looks(line, drive, 80 * [15 * MS], FOR_A_CLIENT)
     assert sum(times == 1 for times, _ in found) == 70

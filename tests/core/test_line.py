@@ -130,9 +130,7 @@ def test_no_request_is_sent_before_the_required_silence_has_passed(line: LineDri
 
 
 @pytest.mark.parametrize(("before", "after"), [(4, 10), (10, 4), (7, 7)])
-def test_the_silence_between_two_exchanges_is_the_longer_of_their_silences(
-    line: LineDriver, before: int, after: int
-) -> None:
+def test_the_longer_silence_of_two_exchanges_is_kept(line: LineDriver, before: int, after: int) -> None:
     line.send(exchange(READ, silence=before * MS))
     line.now += 20 * MS
     answer(line, reply_of(1))
@@ -392,9 +390,7 @@ REASONS = [
 @pytest.mark.parametrize(
     ("received", "reason"), [each[1:] for each in REASONS], ids=[each[0] for each in REASONS]
 )
-def test_the_result_at_the_timeout_gives_the_reason(
-    line: LineDriver, received: bytes, reason: int, piece: int
-) -> None:
+def test_a_timeout_gives_the_reason(line: LineDriver, received: bytes, reason: int, piece: int) -> None:
     ask(line, READ_TWO)
     sent = line.now
     answer(line, received, piece)
@@ -445,9 +441,7 @@ def test_a_reply_is_found_after_4096_bytes_of_noise(line: LineDriver, seed: int,
 
 
 @pytest.mark.parametrize("received", [b"\x01\x03\xfa", b"\x01", b"\x01\x83", b"\x04\x04", b"\xff"])
-def test_a_search_in_endless_garbage_keeps_less_than_a_frame_of_bytes(
-    line: LineDriver, received: bytes
-) -> None:
+def test_a_search_in_endless_garbage_keeps_less_than_a_frame(line: LineDriver, received: bytes) -> None:
     ask(line, Message(1, 0x03, 0, 125))
     garbage = received * 20_000
     for at in range(0, len(garbage), 64):
@@ -499,9 +493,7 @@ def test_a_reply_after_another_masters_read_is_not_accepted(line: LineDriver, pi
 
 
 @pytest.mark.parametrize("before", ["02 03 00 40 00 01", "01 04 00 40 00 01", "01 06 00 40 00 01"])
-def test_a_reply_after_another_masters_write_or_other_request_is_accepted(
-    line: LineDriver, before: str
-) -> None:
+def test_a_reply_after_another_masters_other_request_is_accepted(line: LineDriver, before: str) -> None:
     assert exchanged(line, rtu(before) + reply_of(7)).reply.data == words(7)
 
 
@@ -631,9 +623,7 @@ def test_the_configured_echo_of_a_delixi_query_is_not_taken_for_a_value(line: Li
     assert (line.completion.reply.data, line.completion.skipped) == (value, 21)
 
 
-def test_a_copy_of_a_request_is_no_reply_while_it_may_be_an_echo(
-    line: LineDriver,
-) -> None:
+def test_a_copy_of_a_request_is_no_reply_while_it_may_be_an_echo(line: LineDriver) -> None:
     found = exchanged(line, confirmation(), WRITE)
     assert (found.result, found.raw) == (Failure.MAYBE_ECHO, confirmation())
     found = exchanged(line, confirmation() + confirmation(), WRITE)  # two copies, so the adapter echoes
@@ -648,9 +638,7 @@ def test_a_reply_without_an_echo_shows_that_the_adapter_does_not_echo(line: Line
 
 
 @pytest.mark.parametrize(("stray", "told"), [(1, True), (3, True), (4, False), (8, False)])
-def test_a_few_stray_bytes_before_a_reply_are_not_taken_for_an_echo(
-    line: LineDriver, stray: int, told: bool
-) -> None:
+def test_a_few_stray_bytes_before_a_reply_are_no_echo(line: LineDriver, stray: int, told: bool) -> None:
     """A line driver may send a zero byte before every reply: confirmations are still accepted."""
     assert exchanged(line, bytes(stray) + reply_of(1)).reply.data == words(1)
     assert (exchanged(line, bytes(stray) + confirmation(), WRITE).result == 8) is told
@@ -688,9 +676,7 @@ def query(line: LineDriver) -> None:
 
 @pytest.mark.parametrize("piece", [4096, 1], ids=["whole", "byte by byte"])
 @pytest.mark.parametrize("gap", [0, 5 * MS, TIMEOUT // 2])
-def test_the_first_echo_of_a_line_without_echo_is_not_a_value_of_0(
-    line: LineDriver, gap: int, piece: int
-) -> None:
+def test_a_first_echo_is_not_taken_for_a_value_of_0(line: LineDriver, gap: int, piece: int) -> None:
     query(line)
     line.receive(ECHO, piece)
     assert line.listens
@@ -761,9 +747,7 @@ def receive_at_pace(line: LineDriver, begin: int, frame: bytes) -> None:
             line.now = line.wake
 
 
-def test_a_delixi_value_of_0_ends_the_exchange_if_it_comes_when_a_reply_is_due(
-    line: LineDriver, steady: Peer
-) -> None:
+def test_a_delixi_value_of_0_ends_the_exchange_if_it_is_due(line: LineDriver, steady: Peer) -> None:
     """An echo would have come earlier, so this copy of the request is the reply."""
     make_steady(line, steady)
     for _ in range(5):
@@ -774,7 +758,7 @@ def test_a_delixi_value_of_0_ends_the_exchange_if_it_comes_when_a_reply_is_due(
 
 
 @pytest.mark.parametrize("insists", [False, True])
-def test_the_line_waits_until_the_timeout_after_a_copy_that_may_be_an_echo(
+def test_a_copy_that_may_be_an_echo_ends_at_the_timeout(
     line: LineDriver, steady: Peer, insists: bool
 ) -> None:
     """The copy came too early for a reply, or the read has `insists`, which ignores arrival times."""
@@ -790,9 +774,7 @@ def test_the_line_waits_until_the_timeout_after_a_copy_that_may_be_an_echo(
 
 
 @pytest.mark.parametrize("later", [0, 10 * MS, TIMEOUT // 2])
-def test_the_first_echo_on_a_steady_drive_s_line_is_not_a_value_of_0(
-    line: LineDriver, steady: Peer, later: int
-) -> None:
+def test_a_steady_drives_first_echo_is_not_a_value_of_0(line: LineDriver, steady: Peer, later: int) -> None:
     make_steady(line, steady)
     end = send_query(line, steady)
     line.receive(ECHO)

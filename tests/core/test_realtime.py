@@ -105,9 +105,7 @@ aside_log.flush(10)
 
 
 @pytest.mark.long
-def test_a_flooded_port_ends_realtime_scheduling(
-    realtime: Realtime, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_flood_ends_realtime_scheduling(realtime: Realtime, caplog: pytest.LogCaptureFixture) -> None:
     """The core's thread discards bytes that a program sends as fast as the computer can."""
     near, far = socket.socketpair()
     near.setblocking(False)
@@ -149,9 +147,7 @@ def test_wake_lateness_measures_how_late_the_core_wakes() -> None:
     assert all(each >= 0 for each in late)
 
 
-def test_only_the_first_and_the_last_client_switch_realtime_scheduling(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_only_the_first_and_last_client_switch_realtime_scheduling(monkeypatch: pytest.MonkeyPatch) -> None:
     """A thread that has ended realtime by itself must not start it again for a second client."""
     switched: list[bool] = []
 

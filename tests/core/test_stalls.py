@@ -264,9 +264,7 @@ def patient(message: Message) -> Exchange:
     return exchange(message, timeout=PATIENCE)
 
 
-def test_a_drivers_count_of_unsent_bytes_is_ignored_if_it_stays_above_0_despite_replies(
-    ends: Ends, port: Port
-) -> None:
+def test_a_count_of_unsent_bytes_that_stays_above_0_is_ignored(ends: Ends, port: Port) -> None:
     requests = [READ, OTHER, READ, START, SILENT, OTHER]
     with Device(ends[1], len(requests), miscounted=0) as device:
         for request in requests[:4]:
@@ -278,9 +276,7 @@ def test_a_drivers_count_of_unsent_bytes_is_ignored_if_it_stays_above_0_despite_
     assert device.heard == [frame(request) for request in requests]
 
 
-def test_a_silent_drive_does_not_delay_others_although_the_driver_miscounts_unsent_bytes(
-    ends: Ends, port: Port
-) -> None:
+def test_a_wrong_count_of_unsent_bytes_does_not_delay_other_drives(ends: Ends, port: Port) -> None:
     requests = [READ, OTHER, SILENT, READ, SILENT]
     with Device(ends[1], len(requests), miscounted=0):
         for request in requests[:2]:
@@ -292,18 +288,14 @@ def test_a_silent_drive_does_not_delay_others_although_the_driver_miscounts_unse
 
 
 @pytest.mark.parametrize(("failures", "was_wrong", "seconds"), [(0, 0, 30), (1, 0, 40), (0, 1, 1), (1, 1, 1)])
-def test_after_a_long_stall_an_answering_drive_is_read_first(
-    failures: int, was_wrong: int, seconds: int
-) -> None:
+def test_after_a_stall_an_answering_drive_is_read_first(failures: int, was_wrong: int, seconds: int) -> None:
     peer, line = Peer(least_timeout=1, most_timeout=1), LineDriver()
     peer.c.failures = failures
     line.begin(exchange(READ, peer=peer))
     assert lib.md_line_hold_ns(line._line, was_wrong) == seconds * 10**9
 
 
-def test_a_count_of_unsent_bytes_that_becomes_wrong_is_ignored_after_three_replies(
-    ends: Ends, port: Port
-) -> None:
+def test_a_wrong_count_of_unsent_bytes_is_ignored_after_three_replies(ends: Ends, port: Port) -> None:
     with Device(ends[1], 6, miscounted=2):
         for _ in range(3):
             assert port.carry_out(patient(READ)).result > 0
@@ -315,9 +307,7 @@ def test_a_count_of_unsent_bytes_that_becomes_wrong_is_ignored_after_three_repli
     assert port.miscounts
 
 
-def test_a_count_of_unsent_bytes_that_falls_shortly_after_each_reply_is_not_ignored(
-    ends: Ends, port: Port
-) -> None:
+def test_a_count_of_unsent_bytes_that_falls_after_each_reply_is_not_ignored(ends: Ends, port: Port) -> None:
     with Device(ends[1], 5, lag=TIMEOUT_S / 2):
         for _ in range(5):
             assert port.carry_out(patient(READ)).result > 0
@@ -325,9 +315,7 @@ def test_a_count_of_unsent_bytes_that_falls_shortly_after_each_reply_is_not_igno
     assert (port.miscounts, port.is_stalled) == (False, True)
 
 
-def test_a_stop_does_not_wait_although_the_count_of_unsent_bytes_may_be_out_of_date(
-    ends: Ends, port: Port
-) -> None:
+def test_a_stop_does_not_wait_for_an_outdated_count_of_unsent_bytes(ends: Ends, port: Port) -> None:
     """The port ignores a wrong count after three requests that waited for it. The stop does not wait."""
     stop = exchange(START, timeout=PATIENCE, insists=True)
     with Device(ends[1], 4, miscounted=0):

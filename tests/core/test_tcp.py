@@ -198,9 +198,7 @@ def test_a_modbus_tcp_reply_may_come_in_pieces(line: LineDriver, drive: Peer, pi
 
 
 @pytest.mark.parametrize("cut", range(1, 11))
-def test_a_reply_whose_rest_comes_after_the_timeout_does_not_disturb_later_exchanges(
-    line: LineDriver, drive: Peer, cut: int
-) -> None:
+def test_a_late_rest_of_a_reply_disturbs_no_exchange(line: LineDriver, drive: Peer, cut: int) -> None:
     late = value(ask(line, drive), 1)
     line.receive(late[:cut])
     line.wait_until_done()
@@ -255,9 +253,7 @@ def test_the_timeout_adapts_to_the_delay_of_a_late_tcp_reply(line: LineDriver, d
 
 
 @pytest.mark.parametrize("code", [0x0A, 0x0B])
-def test_a_gateways_exception_for_a_silent_drive_counts_as_no_reply(
-    line: LineDriver, drive: Peer, code: int
-) -> None:
+def test_a_gateways_exception_counts_as_no_reply(line: LineDriver, drive: Peer, code: int) -> None:
     for number in (1, 2):
         line.receive(tcp(ask(line, drive), bytes([1, 0x83, code])))
         assert (line.want, line.completion.result) == ("done", Failure.NO_REPLY)
@@ -335,9 +331,7 @@ def test_a_reply_with_a_wrong_length_in_its_header_fails_only_its_exchange(
 
 @pytest.mark.parametrize("missing", range(1, 10))
 @pytest.mark.parametrize("transactions", [Transactions.MATCHED, Transactions.IGNORED])
-def test_an_incomplete_reply_fails_only_its_exchange(
-    drive: Peer, missing: int, transactions: Transactions
-) -> None:
+def test_a_short_reply_fails_only_its_exchange(drive: Peer, missing: int, transactions: Transactions) -> None:
     line = LineDriver(transactions)
     assert is_read(line, drive, 1)
     line.receive(value(ask(line, drive), 7)[:-missing])
@@ -366,9 +360,7 @@ def test_frames_sent_by_the_peer_when_it_is_connected_are_not_replies(line: Line
     assert is_read(line, drive, 7)
 
 
-def test_an_incomplete_reply_fails_two_exchanges_if_bytes_come_one_by_one(
-    line: LineDriver, drive: Peer
-) -> None:
+def test_an_incomplete_reply_fails_two_exchanges_if_bytes_come_singly(line: LineDriver, drive: Peer) -> None:
     assert is_read(line, drive, 1)
     line.receive(value(ask(line, drive), 7)[:-1])
     line.wait_until_done()
@@ -445,17 +437,13 @@ def gateway() -> LineDriver:
     return LineDriver(Transactions.IGNORED)
 
 
-def test_if_transaction_ids_are_ignored_a_reply_with_another_id_is_accepted(
-    gateway: LineDriver, drive: Peer
-) -> None:
+def test_with_ignored_ids_a_reply_with_another_id_is_accepted(gateway: LineDriver, drive: Peer) -> None:
     for raw in range(10):
         line = gateway
         assert line.data_after(value((ask(line, drive) + 1) & 0xFFFF, raw)) == words(raw)
 
 
-def test_if_transaction_ids_are_ignored_a_late_reply_delays_the_next_request(
-    gateway: LineDriver, drive: Peer
-) -> None:
+def test_with_ignored_ids_a_late_reply_delays_the_next_request(gateway: LineDriver, drive: Peer) -> None:
     miss(gateway, drive)
     gateway.begin(exchange(READ, drive))
     assert gateway.completion.result == Failure.LATE_ANSWER_DUE
@@ -467,9 +455,7 @@ def test_if_transaction_ids_are_ignored_a_late_reply_delays_the_next_request(
     assert gateway.completion.reply.data == words(2)
 
 
-def test_if_ids_are_ignored_a_drive_may_reply_after_a_gateways_exception(
-    gateway: LineDriver, drive: Peer
-) -> None:
+def test_with_ignored_ids_a_drive_may_reply_after_an_exception(gateway: LineDriver, drive: Peer) -> None:
     gateway.receive(tcp(ask(gateway, drive), bytes([1, 0x83, 0x0B])))
     assert gateway.completion.result == Failure.NO_REPLY
     assert drive.late_until_ns > gateway.now
@@ -484,9 +470,7 @@ def ends() -> Iterator[tuple[socket.socket, socket.socket]]:
         yield ours, theirs
 
 
-def test_bytes_that_are_not_modbus_tcp_end_the_connection_as_lost(
-    ends: tuple[socket.socket, socket.socket], drive: Peer
-) -> None:
+def test_other_bytes_end_a_connection_as_lost(ends: tuple[socket.socket, socket.socket], drive: Peer) -> None:
     ours, theirs = ends
     port = Port(ours.fileno(), -1, transactions=Transactions.MATCHED)
     try:

@@ -163,9 +163,7 @@ def test_every_number_format_byte_order_step_and_offset_is_decoded_and_encoded(
 @settings(max_examples=examples(60), deadline=None)
 @given(numbers().filter(lambda case: case[0] in WRITTEN and case[0] not in FLOATS))
 @example((NumberFormat.U64, "BADC", 1, 0, 2**64 - 1))
-def test_whole_number_written_to_a_drive_is_read_back_unchanged(
-    case: tuple[NumberFormat, str, float, float, float],
-) -> None:
+def test_written_whole_number_is_read_back(case: tuple[NumberFormat, str, float, float, float]) -> None:
     number_format, order, step, offset, raw = case
     details: dict[str, Any] = {"number_format": number_format, "order": order, "step": step, "offset": offset}
     family = declared(level=setting(7, "m", kept=Kept.RAM, **details))
@@ -190,9 +188,7 @@ def test_whole_number_written_to_a_drive_is_read_back_unchanged(
     max_examples=examples(30), deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(data=st.data())
-def test_float_written_to_a_drive_is_read_back_unchanged(
-    number_format: NumberFormat, order: str, data: st.DataObject
-) -> None:
+def test_written_float_is_read_back(number_format: NumberFormat, order: str, data: st.DataObject) -> None:
     raw = data.draw(counts(number_format))
     family = declared(level=setting(7, "m", kept=Kept.RAM, number_format=number_format, order=order))
     register = family.registers["level"]

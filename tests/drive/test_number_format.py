@@ -84,9 +84,7 @@ def on_the_wire(register: Register[Any], number: float) -> bytes:
 @formats
 @settings(max_examples=examples(30))
 @given(data=st.data())
-def test_written_number_has_the_bytes_of_its_number_format(
-    register: Register[float], data: st.DataObject
-) -> None:
+def test_written_number_has_the_bytes_of_its_format(register: Register[float], data: st.DataObject) -> None:
     number = data.draw(numbers(register))
     request = write_request(Meter(1), register, register.encode(number))
     # 0 replaces -0.0, which is sent without its sign
@@ -145,9 +143,7 @@ def test_floats_are_formatted_as_their_shortest_decimals(value: float, text: str
         assert Meter.f32.format(Meter.f32.decode(Meter.f32.encode(value))) == text
 
 
-def test_half_precision_float_is_formatted_as_its_shortest_decimal(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_half_float_is_formatted_as_its_shortest_decimal(capsys: pytest.CaptureFixture[str]) -> None:
     assert Meter.f16.format(nearest_value(Meter.f16, 12.1)) == "12.1 V"
     assert capsys.readouterr().err == ""
     assert nearest_value(Meter.f16, 2049.0) == 2048
@@ -179,9 +175,7 @@ def test_simulated_drive_refuses_floats_outside_the_limits() -> None:
     assert sim["f32"] == math.inf
 
 
-def test_command_line_warns_if_a_float_register_rounds_the_number(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_command_line_warns_if_a_float_register_rounds_the_number(capsys: pytest.CaptureFixture[str]) -> None:
     (single,) = struct.unpack(">f", struct.pack(">f", 12.1))
     assert nearest_value(Meter.f32, Meter.f32.parse("12.1")) == single
     # no warning, because the rounded number is shown with the digits that the user typed

@@ -184,9 +184,7 @@ def test_integer_too_large_for_a_float_is_refused(name: str, number: int) -> Non
         (9600, "8O2", 12),
     ],
 )
-def test_duration_of_a_character_includes_start_parity_and_stop_bits(
-    baudrate: int, format: str, bits: int
-) -> None:
+def test_duration_of_a_character_includes_all_of_its_bits(baudrate: int, format: str, bits: int) -> None:
     assert Settings(baudrate, format).character == pytest.approx(bits / baudrate)
 
 
@@ -290,9 +288,7 @@ def test_state_that_sets_attributes_of_the_drive_is_computed_each_time() -> None
         ("delixi-modbus", {"output_frequency": 25.0}, None),
     ],
 )
-def test_fault_is_detected_from_the_status_word_alone(
-    model: str, values: dict[str, float], condition: Condition | None
-) -> None:
+def test_status_word_shows_a_fault(model: str, values: dict[str, float], condition: Condition | None) -> None:
     found = StateReader(MODELS[model](1)).state(values)
     assert (found and found.condition) == condition
     assert found is None or found.fault is None

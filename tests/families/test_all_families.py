@@ -125,9 +125,7 @@ def test_base_class_drive_cannot_be_used_as_a_family() -> None:
 @family
 @table("name", ["start", "jog"])
 @table("given", ["reverse", "forward", True, 25.0, CHEStatus.REVERSE])
-def test_start_with_a_value_that_is_not_a_direction_raises_type_error(
-    family: type[Drive], name: str, given: object
-) -> None:
+def test_start_in_an_invalid_direction_raises(family: type[Drive], name: str, given: object) -> None:
     """A wrong direction must not turn the motor, so no frame is sent."""
     drive = family(family.addresses[0], name="pump")
     drive.perform = pytest.fail
@@ -194,9 +192,7 @@ def test_every_register_names_its_section_of_the_manual(family: type[Drive]) -> 
 
 
 @table("family, register", registers(lambda each: each.span))
-def test_limits_of_a_register_can_be_encoded_and_values_beyond_cannot(
-    family: type[Drive], register: Register[Any]
-) -> None:
+def test_only_values_within_limits_can_be_encoded(family: type[Drive], register: Register[Any]) -> None:
     assert register.span
     low, high = register.span
     step = float(register.scale)
@@ -208,9 +204,7 @@ def test_limits_of_a_register_can_be_encoded_and_values_beyond_cannot(
 
 
 @table("family, register", registers(lambda each: each.span and each.default is not None))
-def test_every_factory_value_is_within_the_registers_limits(
-    family: type[Drive], register: Register[Any]
-) -> None:
+def test_every_factory_value_is_within_its_limits(family: type[Drive], register: Register[Any]) -> None:
     assert register.decode(register.encode(register.default)) == register.default
 
 

@@ -193,9 +193,7 @@ def test_delixi_identify_checks_address_and_baud_rate() -> None:
         ("frequency", 0.0, "set_frequency"),
     ],
 )
-def test_delixi_start_is_refused_in_a_fault_or_without_line_control(
-    name: str, held: float, sentence: str
-) -> None:
+def test_delixi_start_needs_line_control_and_no_fault(name: str, held: float, sentence: str) -> None:
     wire = Wire(DelixiModbus(1), {**STANDING, name: held})
     with pytest.raises(WriteForbidden, match=sentence):
         wire.drive.start()

@@ -144,9 +144,7 @@ def test_delixi_native_start_is_refused_if_the_motor_could_start_later(status: i
         ({"fault": DelixiFault.OC_OVERCURRENT}, "has a fault, overcurrent .OC.: remove its cause"),
     ],
 )
-def test_delixi_native_start_is_refused_in_a_fault_or_without_line_control(
-    says: dict[str, object], sentence: str
-) -> None:
+def test_delixi_native_start_needs_line_control_and_no_fault(says: dict[str, object], sentence: str) -> None:
     wire = Wire(DelixiNative(1), STANDING | says, turns=TURNS)
     wire.drive.set_frequency(50)
     with pytest.raises(WriteForbidden, match=sentence):
@@ -231,9 +229,7 @@ def test_delixi_fault_codes_may_be_decimal_or_hex_digits(raw: int, fault: int) -
         ({"status": 9}, State(Condition.UNKNOWN, note="K = 03 says 0009H, which is not explained")),
     ],
 )
-def test_delixi_native_state_shows_run_state_direction_and_fault(
-    says: dict[str, object], state: State
-) -> None:
+def test_delixi_native_state_shows_run_direction_and_fault(says: dict[str, object], state: State) -> None:
     assert Wire(DelixiNative(1), says).drive.state() == state
 
 

@@ -304,9 +304,7 @@ def test_erman_setpoint_is_written_to_0002h_within_its_limits() -> None:
         ),
     ],
 )
-def test_erman_state_shows_the_ramp_phase_and_the_last_fault(
-    status: int, fault: int, condition: Condition, note: str
-) -> None:
+def test_erman_state_shows_phase_and_fault(status: int, fault: int, condition: Condition, note: str) -> None:
     says = {"status": ErmanERG220.status.decode(status), "last_fault": ErmanERG220.last_fault.decode(fault)}
     state = Wire(ErmanERG220(1), says).drive.state()
     assert (state.condition, state.note, state.fault) == (condition, note, None)

@@ -143,9 +143,7 @@ def test_innovert_ibd_start_with_a_direction_needs_the_option_forward_bit(direct
 
 
 @table(("forward_bit", "forward", "reverse"), [(2, "06", "0A"), (3, "0A", "06")])
-def test_innovert_ibd_option_forward_bit_selects_the_direction_word(
-    forward_bit: int, forward: str, reverse: str
-) -> None:
+def test_innovert_ibd_forward_bit_selects_direction(forward_bit: int, forward: str, reverse: str) -> None:
     says = {**STANDING, "terminals": Terminals(0)}
     drive = InnovertIBD(1, forward_bit=forward_bit)
     words = [frame(drive, drive.control, IBDControl(int(each, 16))) for each in (forward, reverse, "02")]
@@ -204,9 +202,7 @@ def test_innovert_ibd_start_after_jog_and_stop_runs_at_the_setpoint() -> None:
         ({}, "set_frequency"),
     ],
 )
-def test_innovert_ibd_start_is_refused_in_a_fault_or_if_not_set_up(
-    says: dict[str, object], sentence: str
-) -> None:
+def test_innovert_ibd_start_needs_a_setup_and_no_fault(says: dict[str, object], sentence: str) -> None:
     wire = Wire(InnovertIBD(1), {**STANDING, "terminals": Terminals(0), **says})
     with pytest.raises(WriteForbidden, match=sentence):
         wire.drive.start()

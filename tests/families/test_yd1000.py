@@ -260,9 +260,7 @@ def test_yd1000_line_settings_and_limits_are_those_of_the_document() -> None:
         (YD1000Control(0), "01 06 10 00 00 00 8D 0A"),
     ],
 )
-def test_yd1000_control_words_without_bit_14_are_encoded_as_printed(
-    word: YD1000Control, printed: str
-) -> None:
+def test_yd1000_control_words_without_bit_14_are_sent_as_printed(word: YD1000Control, printed: str) -> None:
     assert frame(YD1000(1), YD1000.control, word) == printed
 
 
@@ -287,9 +285,7 @@ def yd_word(word: int) -> str:
         ({}, 0xC400, 0xC600),
     ],
 )
-def test_yd1000_start_options_select_the_control_bits(
-    options: dict[str, float], forward: int, reverse: int
-) -> None:
+def test_yd1000_start_options_select_the_bits(options: dict[str, float], forward: int, reverse: int) -> None:
     words = [yd_word(forward), yd_word(reverse)]
     turns = dict(zip(words, (TURNS[FORWARD], TURNS[REVERSE]), strict=True))
     wire = Wire(YD1000(1, **options), AT_30_HZ, turns=turns)

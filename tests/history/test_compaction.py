@@ -99,7 +99,7 @@ def test_ten_second_summaries_equal_those_computed_in_plain_python(tmp_path: Pat
 
 
 @pytest.mark.long
-def test_ten_second_summaries_of_past_hours_are_merged_into_one_file(tmp_path: Path) -> None:
+def test_summaries_of_past_hours_are_merged_into_one_file(tmp_path: Path) -> None:
     begins = [NOON + 1200 * SECOND * number for number in range(5)]
     record(tmp_path, [random_rows(number, begin, 20) for number, begin in enumerate(begins)])
     compact(tmp_path, 6)
@@ -112,9 +112,7 @@ def test_ten_second_summaries_of_past_hours_are_merged_into_one_file(tmp_path: P
 
 
 @pytest.mark.long
-def test_ten_second_summaries_of_past_days_are_merged_into_one_file(
-    tmp_path: Path, rows: list[list[Row]]
-) -> None:
+def test_summaries_of_past_days_are_merged_into_one_file(tmp_path: Path, rows: list[list[Row]]) -> None:
     compact(tmp_path, 6)
     tens = parquet_files(tmp_path / "tens")
     assert [(file.first, file.last) for file in tens] == [(1, 2), (3, 4), (5, 5)]
@@ -124,9 +122,7 @@ def test_ten_second_summaries_of_past_days_are_merged_into_one_file(
 
 @pytest.mark.long
 @pytest.mark.usefixtures("rows")
-def test_compaction_opens_a_database_once_and_only_if_needed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_compaction_opens_a_database_only_if_needed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     opened: list[str] = []
 
     def noted(memory: str, spill: Path) -> Any:
@@ -262,9 +258,7 @@ def _readable(path: Path) -> list[Row]:
 
 @pytest.mark.long
 @pytest.mark.parametrize("content", usually(b"\0" * 5000, b"", b"\xff\xff\xff\xff"))
-def test_segments_beside_an_empty_or_zeroed_segment_are_read(
-    tmp_path: Path, rows: list[list[Row]], content: bytes
-) -> None:
+def test_segments_beside_an_empty_one_are_read(tmp_path: Path, rows: list[list[Row]], content: bytes) -> None:
     """After a power cut a file may be empty or contain zeros."""
     (tmp_path / "rows.00000002.arrows").write_bytes(content)
     left = [*chain(rows[0], *rows[2:])]

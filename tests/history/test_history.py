@@ -327,9 +327,7 @@ def test_export_without_duckdb_uses_pyarrow(tmp_path: Path, monkeypatch: pytest.
 
 @pytest.mark.slow
 @pytest.mark.parametrize("most", [0, 150, 100_000], ids="{} rows are kept".format)
-def test_buckets_of_a_growing_segment_include_all_rows(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int
-) -> None:
+def test_buckets_include_all_new_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int) -> None:
     """Queries for changing series and ranges use cached rows. Some ranges start before the cached rows,
     others long after them.
     """
@@ -351,9 +349,7 @@ def test_buckets_of_a_growing_segment_include_all_rows(
                 assert end - begin < 8 * SECOND or grid_of(begin, end, 4).is_of_tens
 
 
-def test_cache_of_requests_for_unknown_series_is_limited(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_cache_of_unknown_series_is_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(growing, "MOST_SERIES", 3)
     with SegmentWriter(tmp_path / "rows.arrows", METADATA, every=1e9) as writer, History(tmp_path) as history:
         writer.write(from_rows(random_rows(1, NOON, 200)))
@@ -385,9 +381,7 @@ def test_duckdb_uses_a_private_temporary_folder(tmp_path: Path, monkeypatch: pyt
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_reader_succeeds_although_files_are_replaced_repeatedly(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_reader_copes_with_replaced_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each file that the reader lists is replaced before it is read, as may happen on a busy machine."""
     record(tmp_path, [random_rows(1, NOON, 100)])
     replaced = iter(range(20))

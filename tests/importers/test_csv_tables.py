@@ -194,9 +194,7 @@ def test_csv_register_of_three_words_without_a_type_is_not_imported(tmp_path: Pa
         ("", None, "the order of its words is not stated"),
     ],
 )
-def test_ambiguous_byte_order_in_a_csv_table_is_marked_as_a_gap(
-    tmp_path: Path, cell: str, order: str | None, gap: str
-) -> None:
+def test_ambiguous_csv_byte_order_is_a_gap(tmp_path: Path, cell: str, order: str | None, gap: str) -> None:
     device = row(tmp_path, "address,type,byte order", f"0x10,uint32,{cell}")
     assert (entries(device)["a"].get("order"), found(device)) == (order, [gap] if gap else [])
 
@@ -212,9 +210,7 @@ WRITTEN = ["it is written there; what a write does is not known here"]
         ("sometimes", ["its access 'sometimes' is not known; it is read here"]),
     ],
 )
-def test_write_access_and_unknown_access_in_a_csv_table_are_marked_as_gaps(
-    tmp_path: Path, word: str, said: list[str]
-) -> None:
+def test_write_or_unknown_csv_access_is_marked_as_a_gap(tmp_path: Path, word: str, said: list[str]) -> None:
     assert found(row(tmp_path, "address,type,access", f"0x10,uint16,{word}")) == said
 
 

@@ -128,9 +128,7 @@ def test_esphome_controllers_with_the_same_bus_and_address_are_one_device(tmp_pa
     assert (first.title, second.title) == ("node", "node 2")
 
 
-def test_esphome_entity_that_names_none_of_several_controllers_is_not_imported(
-    tmp_path: Path,
-) -> None:
+def test_esphome_entity_that_names_none_of_several_controllers_is_not_imported(tmp_path: Path) -> None:
     controllers = FAST + "  - {id: slow, address: 2, modbus_id: m}\n"
     device = only(tmp_path, "node.yaml", node(controllers, VOLTS, AMPS))
     assert omissions(device) == [
@@ -162,9 +160,7 @@ packages:
 
 
 @pytest.mark.parametrize("text", [f"sensor:\n  - {VOLTS}\n", f"- {VOLTS}\n"])
-def test_esphome_package_without_its_controller_has_an_unknown_address(
-    run: Run, tmp_path: Path, text: str
-) -> None:
+def test_esphome_package_without_controller_has_no_address(run: Run, tmp_path: Path, text: str) -> None:
     device = only(tmp_path, "package.yaml", text)
     assert (device.title, device.address, list(entries(device))) == ("fast", None, ["volts"])
     source, family, plant = (tmp_path / name for name in ("package.yaml", "m.toml", "plant.toml"))
@@ -181,9 +177,7 @@ def test_esphome_package_without_its_controller_has_an_unknown_address(
         (node(FAST, VOLTS.replace("address: 3", "id: 3")), "volts: it has no address"),
     ],
 )
-def test_invalid_esphome_document_raises_value_error_with_the_reason(
-    tmp_path: Path, text: str, reason: str
-) -> None:
+def test_invalid_esphome_document_raises_value_error(tmp_path: Path, text: str, reason: str) -> None:
     (tmp_path / "a.yaml").write_text(text)
     with pytest.raises(ValueError, match=re.escape(reason)):
         read_devices(tmp_path / "a.yaml")

@@ -55,9 +55,7 @@ def test_missing_or_contradictory_home_assistant_width_is_marked_as_a_gap(tmp_pa
 
 
 @pytest.mark.parametrize("keys", ["data_type: int, count: 3", "data_type: uint8", "data_type: custom"])
-def test_home_assistant_entity_of_unsupported_type_is_refused_with_the_type(
-    tmp_path: Path, keys: str
-) -> None:
+def test_home_assistant_entity_of_unsupported_type_is_refused(tmp_path: Path, keys: str) -> None:
     with pytest.raises(ValueError, match=r"a: its type \w+ has no number format"):
         sensor(tmp_path, keys)
 
@@ -198,9 +196,7 @@ def test_home_assistant_platform_layout_of_before_2021_is_imported(tmp_path: Pat
         ("- {name: a, address: 1, data_type: string}\n", "a: it has no count"),
     ],
 )
-def test_invalid_home_assistant_document_raises_value_error_with_the_reason(
-    tmp_path: Path, text: str, reason: str
-) -> None:
+def test_invalid_home_assistant_document_raises_value_error(tmp_path: Path, text: str, reason: str) -> None:
     (tmp_path / "a.yaml").write_text(text)
     with pytest.raises(ValueError, match=re.escape(reason)):
         read_devices(tmp_path / "a.yaml")
@@ -216,9 +212,7 @@ def test_invalid_home_assistant_document_raises_value_error_with_the_reason(
         ("type: serial, port: !secret port", "/dev/ttyUSB0"),
     ],
 )
-def test_unknown_host_of_a_home_assistant_hub_never_becomes_a_serial_port(
-    tmp_path: Path, hub: str, port: str
-) -> None:
+def test_unknown_home_assistant_host_never_becomes_a_port(tmp_path: Path, hub: str, port: str) -> None:
     device = only(tmp_path, "a.yaml", f"modbus:\n  - {{{hub}, sensors: [{{slave: 1, address: 1}}]}}\n")
     assert tomllib.loads(plant_text(device, "m.toml"))["line"][0]["port"] == port
     assert ("the hub: its type udp is not spoken here" in omissions(device)) == ("udp" in hub)

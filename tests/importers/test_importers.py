@@ -292,7 +292,7 @@ def test_yaml_that_is_costly_or_unsafe_to_read_is_refused(tmp_path: Path, text: 
         read_devices(tmp_path / "a.yaml")
 
 
-def test_registers_above_the_limit_of_a_family_are_reported_as_not_imported(
+def test_registers_above_a_familys_limit_are_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Entries above the limit are not checked, because that would be slow for a large file."""

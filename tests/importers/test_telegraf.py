@@ -115,9 +115,7 @@ def test_pauses_that_telegraf_keeps_for_a_device_are_reported(tmp_path: Path) ->
         ('controller = "tcp://gate:${PORT}"', {"port": "tcp://HOST:502"}),
     ],
 )
-def test_telegraf_controller_gives_the_line_settings(
-    tmp_path: Path, line: str, expected: dict[str, str]
-) -> None:
+def test_telegraf_controller_has_line_settings(tmp_path: Path, line: str, expected: dict[str, str]) -> None:
     field = 'holding_registers = [{ name = "a", byte_order = "AB", data_type = "INT16", address = [7] }]\n'
     (device,) = devices(tmp_path, "t.conf", f"[[inputs.modbus]]\nslave_id = 1\n{line}\n{field}")
     (plant,) = tomllib.loads(plant_text(device, "m.toml"))["line"]
@@ -152,9 +150,7 @@ def test_telegraf_slave_ids_0_and_255_are_valid_addresses(tmp_path: Path, unit: 
         ),
     ],
 )
-def test_invalid_telegraf_file_raises_value_error_with_the_reason(
-    tmp_path: Path, text: str, reason: str
-) -> None:
+def test_invalid_telegraf_file_raises_value_error(tmp_path: Path, text: str, reason: str) -> None:
     (tmp_path / "t.conf").write_text(text)
     with pytest.raises(ValueError, match=re.escape(reason)):
         read_devices(tmp_path / "t.conf")

@@ -149,9 +149,7 @@ def test_wb_mqtt_error_value_is_decoded_in_the_registers_format(
         ({"format": "bcd8"}, "its format bcd8 has fewer digits than its registers hold"),
     ],
 )
-def test_wb_mqtt_keys_that_are_not_imported_are_marked_as_gaps(
-    tmp_path: Path, keys: dict[str, Any], gap: str
-) -> None:
+def test_wb_mqtt_keys_that_are_not_imported_are_gaps(tmp_path: Path, keys: dict[str, Any], gap: str) -> None:
     assert gaps(channel(tmp_path, **keys), "a") == [gap]
 
 

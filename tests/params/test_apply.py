@@ -195,9 +195,7 @@ def test_parameter_that_the_drive_lacks_is_left_out() -> None:
         ({"0011": 12000, "0012": 10000, "0013": 9000}, ["0011", "0012", "0013"]),
     ],
 )
-def test_parameters_are_written_in_an_order_that_keeps_their_limits(
-    values: dict[str, int], order: list[str]
-) -> None:
+def test_parameters_are_written_in_an_order_within_limits(values: dict[str, int], order: list[str]) -> None:
     _, drive, sim = attached(YD1000(1), [])
     done = params.apply(drive, values)
     assert done.ok
@@ -290,9 +288,7 @@ def test_stop_while_the_plan_is_read_cancels_all_writes(monkeypatch: pytest.Monk
 
 # free bytes on the disk: in each row, the disk becomes full at another record
 @table("room", [0, 100, 130, 160, 200, 230])
-def test_a_full_disk_ends_apply_and_the_next_apply_completes_the_writes(
-    monkeypatch: pytest.MonkeyPatch, room: int
-) -> None:
+def test_the_apply_after_a_full_disk_completes_the_writes(monkeypatch: pytest.MonkeyPatch, room: int) -> None:
     line, drive, _ = attached(ErmanERG220(1), [])
     # the EEPROM ledger is not affected by the full disk
     monkeypatch.setattr(Ledger, "enter", lambda *given: "")

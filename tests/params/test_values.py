@@ -261,9 +261,7 @@ def test_backup_files_of_the_gd20_tool_are_loaded(tmp_path: Path, quote: str) ->
         ("a.csv", "", "is not a parameter file"),
     ],
 )
-def test_an_invalid_parameter_file_raises_a_one_sentence_error(
-    tmp_path: Path, name: str, text: str, sentence: str
-) -> None:
+def test_invalid_parameter_files_are_refused(tmp_path: Path, name: str, text: str, sentence: str) -> None:
     (tmp_path / name).write_text(text)
     with pytest.raises(ValueError, match=sentence) as raised:
         params.load(tmp_path / name)

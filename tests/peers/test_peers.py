@@ -172,9 +172,7 @@ def test_a_read_from_an_address_without_a_device_times_out(name: str, tmp_path: 
 
 @pytest.mark.slow
 @patient
-def test_the_command_line_can_read_and_write_registers(
-    server: Server, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_commands_read_and_write_registers(server: Server, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["write", *server.words, "frequency", "31.4", "--yes"]) == 0
     assert main(["read", *server.words, "frequency", "current"]) == 0
     shown = capsys.readouterr().out

@@ -162,9 +162,7 @@ def span(register: Register[float]) -> range:
     st.sampled_from([1200, 9600, 38400, 115200]),
     st.sampled_from([Framing.RTU, Framing.ASCII]),
 )
-def test_no_other_way_to_read_random_registers_takes_less_time(
-    pairs: dict[int, bool], baudrate: int, framing: Framing
-) -> None:
+def test_no_other_read_plan_takes_less_time(pairs: dict[int, bool], baudrate: int, framing: Framing) -> None:
     """Registers have one or two words. Some are neighbours, and reserved addresses lie between others."""
     registers = {
         f"r{address}": reading(address, number_format=NumberFormat.U32 if pair else NumberFormat.U16)

@@ -221,9 +221,7 @@ PERIODS = st.sampled_from([None, 0.02, 0.1, 0.5, 2.0])
 @pytest.mark.story
 @settings(max_examples=examples(40), deadline=None)
 @given(st.lists(st.tuples(st.sampled_from(sorted(MODELS)), PERIODS), min_size=1, max_size=8))
-def test_predicted_rates_never_need_more_time_than_the_line_has(
-    wanted: list[tuple[str, float | None]],
-) -> None:
+def test_predicted_rates_need_no_more_time_than_the_line_has(wanted: list[tuple[str, float | None]]) -> None:
     """The exchanges that are predicted for one second fit into one second."""
     exchanges: list[Planned] = []
     for address, (model, every) in enumerate(wanted, 1):
@@ -410,9 +408,7 @@ def test_commands_plan_and_models_suggest_readable_gaps_only_for_a_users_class(
         assert "the family states none" not in told or model in SHIPPED
 
 
-def test_plan_and_models_show_a_familys_register_groups_and_pauses(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_plan_and_models_show_groups_and_pauses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source = (
         "from multidrop import Drive, reading\n"
         "class Own(Drive):\n"

@@ -265,9 +265,7 @@ def test_grouped_registers_are_read_first_in_the_declared_order() -> None:
         ({"most_registers": {HOLDING: 0}}, "not a number from 1 to 125"),
     ],
 )
-def test_invalid_group_limit_or_pause_of_a_family_is_a_declaration_error(
-    details: dict[str, Any], sentence: str
-) -> None:
+def test_invalid_group_limit_or_pause_is_a_declaration_error(details: dict[str, Any], sentence: str) -> None:
     registers = {"a": reading(1), "b": reading(2), "far": reading(9), "input_3": reading(3, table=INPUT)}
     with pytest.raises(DeclarationError, match=sentence):
         family(**registers, run=command(4), **details)

@@ -239,9 +239,7 @@ def test_requests_to_silent_drives_use_at_most_their_share_of_the_line() -> None
 @pytest.mark.story
 @pytest.mark.parametrize("dead", usually(10, 1, 5))
 @pytest.mark.parametrize("period_ms", [None, 400], ids=["in turn", "at a rate"])
-def test_answering_drives_keep_97_percent_of_their_rate_beside_dead_drives(
-    dead: int, period_ms: int | None
-) -> None:
+def test_drives_keep_97_percent_of_their_rate_beside_dead_drives(dead: int, period_ms: int | None) -> None:
     """Of 31 drives, some are dead. The others keep 97 % of the rate that they have without the dead ones."""
     answered: list[int] = []
     for count in (31, 31 - dead):
@@ -500,9 +498,7 @@ def test_every_poll_gets_turns_on_any_overloaded_line(kinds: list[tuple[int, int
 
 @settings(max_examples=examples(50))
 @given(KINDS)
-def test_no_poll_is_skipped_if_all_fit_into_the_shortest_period(
-    kinds: list[tuple[int, int | None, int, int]],
-) -> None:
+def test_no_poll_is_skipped_if_all_fit_into_one_period(kinds: list[tuple[int, int | None, int, int]]) -> None:
     """All jobs together fit into the shortest period, so no slot is ever skipped."""
     least = sum(duration for _, _, duration, _ in kinds)
     made = schedule(*(job(d, p and p + least, duration, kind) for d, p, duration, kind in kinds))

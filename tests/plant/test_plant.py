@@ -445,9 +445,7 @@ def test_five_mistakes_in_one_plant_file_are_reported_together(mistakes: Mistake
         ),
     ],
 )
-def test_each_mistake_in_a_plant_file_gives_one_sentence_with_remedy(
-    mistakes: Mistakes, text: str, sentence: str
-) -> None:
+def test_each_plant_file_mistake_gives_one_sentence(mistakes: Mistakes, text: str, sentence: str) -> None:
     assert mistakes(text) == [sentence]
 
 
@@ -517,9 +515,7 @@ def test_device_path_given_as_plant_file_is_not_read() -> None:
     ],
     ids=["nested", "decimal", "hexadecimal"],
 )
-def test_plant_file_on_which_tomllib_fails_is_reported_in_one_sentence(
-    tmp_path: Path, text: str, sentence: str
-) -> None:
+def test_plant_file_that_tomllib_rejects_is_reported(tmp_path: Path, text: str, sentence: str) -> None:
     (tmp_path / "a.toml").write_text(text)
     with pytest.raises(PlantError, match=sentence) as found:
         load_plant(tmp_path / "a.toml")

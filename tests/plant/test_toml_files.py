@@ -119,9 +119,7 @@ def mistake(data: str | bytes) -> tuple[int, str]:
         (b"a = 1\nb = '\xe4'", 2, "the file is not text in UTF-8, from byte 11 on (0xE4); save it as UTF-8"),
     ],
 )
-def test_text_that_is_not_toml_is_reported_with_a_correction(
-    text: str | bytes, line: int, sentence: str
-) -> None:
+def test_text_that_is_not_toml_is_reported_with_advice(text: str | bytes, line: int, sentence: str) -> None:
     assert mistake(text) == (line, sentence)
 
 

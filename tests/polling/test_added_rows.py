@@ -184,9 +184,7 @@ def test_a_plant_with_a_mistake_in_a_channel_is_refused(port: str) -> None:
         poller.adopt(wrong)
 
 
-def test_a_channel_is_not_computed_if_its_register_is_not_polled(
-    port: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_no_channel_is_computed_of_an_unpolled_register(port: str, caplog: pytest.LogCaptureFixture) -> None:
     other = Channel("other", "pump-1.output_current", "A")
     made = plant(line(port, pump(), PolledDrive(Toy(2, name="pump-2"), [CURRENT], channels=[other])))
     with Poller(made) as poller, caplog.at_level(logging.WARNING):
@@ -218,9 +216,7 @@ def test_channel_totals_are_saved_when_the_poller_is_closed(port: str, tmp_path:
     assert kept["totals"] == [[charges[-1]]]
 
 
-def test_only_the_newest_channel_totals_are_written_to_a_slow_disk(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_slow_disk_gets_only_the_newest_totals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file, queued = TotalsFile(tmp_path / "totals.json"), list[Callable[[], object]]()
     monkeypatch.setattr(file._thread, "put", queued.append)
     file.write({"a": 1})

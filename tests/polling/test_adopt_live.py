@@ -179,7 +179,7 @@ def test_a_drive_that_is_being_removed_cannot_be_started_after_its_stop(both: Tw
         assert not runs(both.pumps[2])
 
 
-def test_drives_of_a_line_that_is_still_opening_are_stopped_at_exit(
+def test_drives_of_an_opening_line_are_stopped_at_exit(
     both: TwoLines, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with Poller(plant(both.hall())) as poller:
@@ -273,9 +273,7 @@ def test_removing_a_line_waits_for_its_stop(both: TwoLines, monkeypatch: pytest.
         assert list(poller.buses) == ["hall"]
 
 
-def test_a_drive_can_be_removed_during_another_drive_s_stop(
-    both: TwoLines, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_drive_can_be_removed_during_another_stop(both: TwoLines, monkeypatch: pytest.MonkeyPatch) -> None:
     with Poller(plant(both.hall())) as poller:
         pump_1, _ = poller.bus("hall").drives
         with blocked_stop(poller.bus("hall"), monkeypatch, pump_1.stop) as stopping:
@@ -284,9 +282,7 @@ def test_a_drive_can_be_removed_during_another_drive_s_stop(
         assert poller.bus("hall").drives == [pump_1]
 
 
-def test_replaced_drives_stay_attached_until_all_stops_have_ended(
-    both: TwoLines, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_replaced_drives_stay_attached_during_stops(both: TwoLines, monkeypatch: pytest.MonkeyPatch) -> None:
     """The new drives have the names of the old ones. Until all stops have ended, the old drives can still be
     stopped.
     """
@@ -334,9 +330,7 @@ def test_a_drive_stays_attached_while_its_new_name_is_used_on_another_line(
             until_sampled(poller, name)
 
 
-def test_a_stop_on_a_line_being_removed_does_not_delay_changes_of_other_lines(
-    both: TwoLines, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stop_on_a_line_delays_no_change_of_others(both: TwoLines, monkeypatch: pytest.MonkeyPatch) -> None:
     with Poller(plant(both.hall(), both.yard())) as poller:
         bus = poller.bus("yard")
         with blocked_stop(bus, monkeypatch, bus.stop_all) as stopping:
@@ -415,9 +409,7 @@ def _is_asking(poller: Poller, of: PolledDrive) -> bool:
     return bus.is_asking(bus.peer(of.drive))
 
 
-def test_closing_a_poller_waits_for_adopt_on_another_thread(
-    both: TwoLines, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_closing_a_poller_waits_for_adopt(both: TwoLines, monkeypatch: pytest.MonkeyPatch) -> None:
     poller = Poller(plant(both.hall()))
     poller.__enter__()
     with Blocked() as opening:
@@ -454,9 +446,7 @@ def test_adopt_connects_to_several_servers_in_parallel(monkeypatch: pytest.Monke
             until_sampled(poller, "fan-1")
 
 
-def test_adopt_opens_other_ports_while_one_port_opens_slowly(
-    both: TwoLines, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_adopt_opens_other_ports_beside_a_slow_one(both: TwoLines, monkeypatch: pytest.MonkeyPatch) -> None:
     nowhere = line("socket://127.0.0.1:1", quick("far", 1), name="far")
     found: dict[str, LineError] = {}
     with Poller(plant(both.hall())) as poller:
@@ -473,9 +463,7 @@ def test_adopt_opens_other_ports_while_one_port_opens_slowly(
     }
 
 
-def test_a_replaced_drive_can_be_stopped_while_a_port_opens_slowly(
-    both: TwoLines, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_drive_can_be_stopped_while_a_port_opens(both: TwoLines, monkeypatch: pytest.MonkeyPatch) -> None:
     replacement = polled(Quick(1, name="pump-1", silence=0.01), [])
     with Poller(plant(both.hall())) as poller, Blocked() as opening:
         poller.bus("hall").drives[0].start()

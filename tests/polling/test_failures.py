@@ -128,9 +128,7 @@ def test_a_failure_on_one_line_does_not_affect_other_lines(
     assert two.poller.failure is None
 
 
-def test_a_line_that_works_again_is_removed_from_line_failures(
-    two: Two, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_line_that_works_again_leaves_line_failures(two: Two, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as broken:
         broken.setattr(PortQueue, "keep_busy", of_line("ill", PortQueue.keep_busy, Ill()))
         two.until(("ill", FAILED))
@@ -151,9 +149,7 @@ def test_a_failing_line_is_retried_at_growing_intervals(
     assert delays[:6] == [0.005, 0.01, 0.02, 0.04, 0.08, 0.1]
 
 
-def test_requests_queued_when_a_line_failed_are_carried_out(
-    two: Two, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_requests_queued_when_a_line_failed_are_sent(two: Two, monkeypatch: pytest.MonkeyPatch) -> None:
     """If a line fails while it queues requests, the poller does not know how many requests are queued."""
     submit, repeat = Port.submit, Port.repeat
     left = 3
@@ -213,9 +209,7 @@ def failed(two: Two, monkeypatch: pytest.MonkeyPatch) -> Two:
     return two
 
 
-def test_take_batches_adopt_and_close_of_a_failed_poller_raise_polling_failed(
-    failed: Two, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_calls_of_a_failed_poller_raise_polling_failed(failed: Two, caplog: pytest.LogCaptureFixture) -> None:
     poller = failed.poller
     assert repr(poller).startswith("<Poller polling has ended on all lines: Ill: of this line;")
     rows: list[Row] = []
@@ -245,9 +239,7 @@ def test_a_failed_poller_stops_polling_but_sends_commands(failed: Two) -> None:
     assert exchanges(failed) - before <= 2  # the read, and an exchange that may have been in flight
 
 
-def test_a_caller_that_waits_for_batches_wakes_when_polling_fails(
-    two: Two, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_wait_for_batches_ends_when_polling_fails(two: Two, monkeypatch: pytest.MonkeyPatch) -> None:
     ended = threading.Event()
 
     def wait() -> None:
@@ -318,9 +310,7 @@ def test_a_failure_of_a_pyserial_bridge_counts_as_a_lost_port(
     until(lambda: "of the bridge" in caplog.text)
 
 
-def test_a_log_handler_that_raises_system_exit_does_not_end_logging(
-    two: Two, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_system_exit_in_a_log_handler_ends_no_logging(two: Two, caplog: pytest.LogCaptureFixture) -> None:
     class Exiting(logging.Handler):
         def emit(self, record: logging.LogRecord) -> None:
             raise SystemExit
@@ -366,9 +356,7 @@ def test_on_batch_rejects_async_and_generator_functions(two: Two, function: Any)
 
 
 @pytest.mark.parametrize("function", [wait, give, give_later])
-def test_a_wrapped_async_on_batch_function_fails_with_its_first_batch(
-    two: Two, function: Callable[[object], Any]
-) -> None:
+def test_a_wrapped_async_on_batch_function_fails_at_once(two: Two, function: Callable[[object], Any]) -> None:
     two.poller.on_batch(lambda batch: function(batch))
     caller = two.poller._caller
     assert caller is not None
@@ -377,9 +365,7 @@ def test_a_wrapped_async_on_batch_function_fails_with_its_first_batch(
         two.poller.close()
 
 
-def test_an_exception_of_a_users_drive_class_affects_only_its_line(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_an_exception_of_a_users_drive_class_affects_only_its_line(monkeypatch: pytest.MonkeyPatch) -> None:
     """A class that a user wrote may work when the poller is made, and fail during polling."""
     failing = threading.Event()
 
@@ -469,9 +455,7 @@ def test_a_slow_on_batch_function_does_not_delay_polling(poller: Poller) -> None
 
 
 @pytest.mark.slow
-def test_an_exception_of_the_on_batch_function_is_logged_and_raised_by_close(
-    poller: Poller, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_on_batch_errors_are_logged_and_raised_once(poller: Poller, caplog: pytest.LogCaptureFixture) -> None:
     calls: list[int] = []
 
     def fail(batch: Batch) -> None:

@@ -95,9 +95,7 @@ STEPS = [*usually(STRIDE, 7), pytest.param(1, marks=NIGHTLY)]
         pytest.param("__exit__", 1, marks=NIGHTLY),
     ],
 )
-def test_a_second_close_completes_an_interrupted_close_of_a_poller(
-    hall: Received, step: int, end: str
-) -> None:
+def test_a_second_close_completes_a_pollers_interrupted_close(hall: Received, step: int, end: str) -> None:
     places: set[str] = set()
 
     def act(nth: int) -> bool:
@@ -123,9 +121,7 @@ def test_a_second_close_completes_an_interrupted_close_of_a_poller(
         pytest.param("__exit__", 1, ZeroDivisionError, marks=NIGHTLY),
     ],
 )
-def test_an_interrupted_close_with_stop_on_exit_stops_the_motors(
-    end: str, step: int, failure: type[BaseException]
-) -> None:
+def test_an_interrupted_close_still_stops_motors(end: str, step: int, failure: type[BaseException]) -> None:
     details = () if end == "close" else (None, None, None)
     handler = signal.getsignal(signal.SIGINT)
 
@@ -265,9 +261,7 @@ def test_a_poller_left_open_at_exit_does_not_corrupt_memory(hall: Received, end:
 
 
 @pytest.mark.parametrize("interrupted", [0, 1, 2])
-def test_an_interrupted_opening_of_several_ports_leaves_none_open(
-    monkeypatch: pytest.MonkeyPatch, interrupted: int
-) -> None:
+def test_interrupted_openings_leave_no_port_open(monkeypatch: pytest.MonkeyPatch, interrupted: int) -> None:
     """All ports are closed, even those that other threads open after the interruption."""
     wires = [Wire([simulated(Toy(1))], unpaced=True, port=ANY_PORT) for _ in range(3)]
     buses: list[Bus] = []

@@ -59,9 +59,7 @@ def quick(address: int) -> tuple[Drive, Picky]:
 @pytest.mark.long
 @table("every", [None, 0.01, 0.5])
 @table("others", [0, 2])
-def test_the_registers_of_a_drive_with_a_least_interval_are_polled_equally_often(
-    every: float | None, others: int
-) -> None:
+def test_registers_with_a_least_interval_are_polled_equally_often(every: float | None, others: int) -> None:
     drive, sim = slow()
     rest = [quick(address) for address in range(2, 2 + others)]
     drives = [

@@ -140,9 +140,7 @@ def test_a_plant_is_polled_while_its_mastership_holds(mastership: Mastership, ev
 
 @pytest.mark.slow
 @paces
-def test_a_line_without_mastership_has_few_rows_of_misses(
-    mastership: Mastership, every: float | None
-) -> None:
+def test_a_line_without_mastership_has_few_rows(mastership: Mastership, every: float | None) -> None:
     """The poller must not run a busy loop while it is not the master."""
     with lines(every) as (_, made), Poller(plant(*made), mastership=mastership) as poller:
         Rows(poller).until("pump", NOT_MASTER)
@@ -183,9 +181,7 @@ def wait_for_bytes(far: int) -> bytes:
 
 @pytest.mark.slow
 @paces
-def test_a_new_master_listens_to_the_line_before_its_first_poll(
-    mastership: Mastership, every: float | None
-) -> None:
+def test_a_new_master_listens_before_its_first_poll(mastership: Mastership, every: float | None) -> None:
     hold(mastership)
     begun = time.monotonic()
     with seen_line(mastership, every) as (far, _):
@@ -215,9 +211,7 @@ def test_nothing_is_sent_during_the_guard_time_of_the_previous_master(port: str)
 
 @pytest.mark.long
 @paces
-def test_another_master_is_reported_and_polling_starts_when_it_falls_silent(
-    mastership: Mastership, every: float | None
-) -> None:
+def test_polling_starts_when_another_master_falls_silent(mastership: Mastership, every: float | None) -> None:
     hold(mastership)
     is_over = threading.Event()
     with seen_line(mastership, every) as (far, poller):
@@ -281,9 +275,7 @@ def far() -> Iterator[Listener]:
 
 
 @pytest.mark.long
-def test_the_port_of_a_removed_line_is_closed_and_receives_no_byte(
-    mastership: Mastership, far: Listener
-) -> None:
+def test_the_port_of_a_removed_line_is_closed_and_gets_no_byte(mastership: Mastership, far: Listener) -> None:
     hold(mastership)
     yard = line(far.url, quick("fan", 1, None), name="yard")
     with lines(0.02) as (_, (hall, _)), Poller(plant(hall), mastership=mastership) as poller:
@@ -324,9 +316,7 @@ def taken_of(poller: Poller, rows: list[Row]) -> list[Row]:
 
 
 @pytest.mark.long
-def test_adding_and_removing_a_line_does_not_interrupt_polling_of_other_lines(
-    mastership: Mastership, far: Listener
-) -> None:
+def test_adding_and_removing_a_line_does_not_interrupt_others(mastership: Mastership, far: Listener) -> None:
     hold(mastership)
     yard = line(far.url, quick("fan", 1, None), name="yard")
     with lines(0.02) as (_, (hall, _)), Poller(plant(hall), mastership=mastership) as poller:
@@ -386,9 +376,7 @@ def test_a_new_mastership_listens_again_before_its_first_request(mastership: Mas
 
 
 @pytest.mark.slow
-def test_many_ports_are_opened_in_parallel_and_closed_without_pauses(
-    mastership: Mastership, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ports_open_and_close_without_pauses(mastership: Mastership, monkeypatch: pytest.MonkeyPatch) -> None:
     """pyserial's own sockets sleep for 0.3 s when they are closed, which would take 19 s for 64 sockets."""
     pauses_s: list[float] = []
     monkeypatch.setattr(protocol_socket, "time", SimpleNamespace(sleep=pauses_s.append))

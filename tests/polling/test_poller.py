@@ -181,9 +181,7 @@ def test_registers_with_and_without_a_rate_are_both_polled(port: str) -> None:
     [[{"baudrate": 9600}, {"baudrate": 19_200}], [{"silence": None}, {"silence": 0.01}]],
     ids=["two baud rates", "two silences"],
 )
-def test_drives_with_equal_baud_rate_and_format_are_polled_one_after_another(
-    kinds: list[dict[str, Any]],
-) -> None:
+def test_drives_with_equal_line_settings_are_polled_in_a_row(kinds: list[dict[str, Any]]) -> None:
     drives = [Toy(at, name=f"drive-{at}", **kinds[at % 2]) for at in range(1, 7)]
     wire = ClockedWire([simulated(drive) for drive in drives], Faults())
     with ClockedLines(wire, [polled(drive, [Toy.fault]) for drive in drives]) as clocked:
@@ -226,9 +224,7 @@ def test_an_asyncio_program_can_wait_for_rows_with_fileno(port: str) -> None:
     assert {row.value for row in rows if row.register == "output_current"} - {None} == {3.25}
 
 
-def test_the_queue_of_rows_is_bounded_and_dropped_rows_are_counted(
-    port: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_dropped_rows_of_the_bounded_queue_are_counted(port: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(poller_module, "RowQueue", lambda: RowQueue(chunk_rows=200, most_chunks=2))
     with Poller(plant(line(port, polled(drive(), READINGS)))) as poller:
         until(lambda: poller.dropped > 0)
@@ -334,9 +330,7 @@ PIECES = {  # further possible statuses, if this computer is too slow to deliver
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_each_fault_of_a_reply_gives_rows_with_the_status_of_that_fault(
-    fault: str, pump: SimulatedDrive
-) -> None:
+def test_each_fault_of_a_reply_gives_rows_with_its_status(fault: str, pump: SimulatedDrive) -> None:
     fate, said = FAULTS[fault]
     # A socket, because a pty's buffer is too small for the noise.
     wire = Faulty([pump], fate, unpaced=True, port="socket://127.0.0.1:0")
@@ -606,7 +600,7 @@ def test_a_request_without_reply_when_polling_ends_has_a_row(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("leaves", ["the poll", "the drive"])
-def test_a_slot_whose_period_has_not_ended_when_polling_ends_has_no_row(
+def test_a_slot_that_is_not_over_when_polling_ends_has_no_row(
     responder: tuple[int, str], leaves: str
 ) -> None:
     """Such a slot does not count as a miss either."""

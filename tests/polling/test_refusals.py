@@ -101,9 +101,7 @@ def test_a_device_with_a_smaller_limit_is_read_in_smaller_blocks() -> None:
 
 
 @pytest.mark.slow
-def test_a_block_that_was_split_is_read_as_a_whole_when_it_is_accepted_again(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_split_block_is_read_as_a_whole_once_it_is_accepted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(refusals, "SET_ASIDE_NS", 2_000_000_000)
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive)
@@ -140,9 +138,7 @@ def test_attempts_to_read_a_split_block_as_a_whole_add_no_rows(monkeypatch: pyte
 @pytest.mark.long
 @pytest.mark.parametrize("every", [None, 0.5])
 @pytest.mark.parametrize("longest", usually(10, 1))
-def test_a_device_that_ignores_long_requests_is_read_with_shorter_ones(
-    longest: int, every: float | None
-) -> None:
+def test_a_device_that_ignores_long_requests_gets_shorter_ones(longest: int, every: float | None) -> None:
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive, silent_beyond=longest)
     with clocked_line_of(drive, sim, every) as clocked:

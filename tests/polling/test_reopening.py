@@ -122,9 +122,7 @@ def test_adopt_opens_all_lines_even_if_few_threads_can_be_started(
 
 
 @pytest.mark.slow
-def test_a_stop_reopens_a_lost_port_after_the_poller_has_failed(
-    hall: Plant, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stop_of_a_failed_poller_reopens_its_port(hall: Plant, monkeypatch: pytest.MonkeyPatch) -> None:
     until(lambda: hall.port.is_lost)
 
     def fail(*_: object) -> None:
@@ -258,9 +256,7 @@ class Fragile(Toy):
     deadly = reading(DEADLY)
 
 
-def test_a_stop_does_not_wait_until_the_poller_reopens_a_port_that_is_lost_often(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_stop_does_not_wait_for_the_poller_to_reopen_a_port(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(polled_line, "REOPEN_NS", 3_600_000_000_000)
     with server(lambda nth, address: False) as port:
         drive = Fragile(1, name="pump")

@@ -99,9 +99,7 @@ def test_silent_drives_hardly_slow_the_others_and_return_soon(dead: int, back_s:
 @pytest.mark.long
 @pytest.mark.story
 @pytest.mark.parametrize(("count", "dead", "every"), [(16, 5, None), (16, 1, 0.5), (31, 10, None)])
-def test_drives_dead_from_the_start_hardly_slow_the_polling_of_other_drives(
-    count: int, dead: int, every: float | None
-) -> None:
+def test_drives_dead_from_the_start_hardly_slow_others(count: int, dead: int, every: float | None) -> None:
     """Every third drive is dead, so that most answering drives are polled after a dead one."""
     gone = {3 * number + 1 for number in range(dead)}
 
@@ -211,9 +209,7 @@ def test_memory_is_bounded_if_a_response_delay_keeps_changing() -> None:
 
 
 @pytest.mark.slow
-def test_the_blocks_of_a_drive_change_only_if_other_blocks_are_faster(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_drives_blocks_change_only_if_others_are_faster(monkeypatch: pytest.MonkeyPatch) -> None:
     """Measured delays always vary a little. That alone must not change the blocks."""
     drive = Wide(1, name="pump-1")
     sim = SimulatedDrive(Wide(1), response_delay=SOON)

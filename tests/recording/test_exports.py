@@ -206,9 +206,7 @@ def test_drives_and_registers_with_similar_names_have_separate_groups_in_hdf5(tm
         assert [group["value"][:].tolist() for group in groups] == [[1.0, 2.0]] * 4
 
 
-def test_interrupt_during_a_write_of_an_hdf5_export_leaves_no_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupted_hdf5_export_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from multidrop.recording.hdf5 import GuardedFile
 
     source, calls, write = record(tmp_path / "run.arrows", rows(100), METADATA), count(), GuardedFile.write

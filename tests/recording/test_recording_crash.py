@@ -120,9 +120,7 @@ def test_a_recording_appended_to_another_is_refused(tmp_path: Path) -> None:
         recorded(first)
 
 
-def test_names_that_would_exceed_memory_are_reported_as_damage(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_names_beyond_memory_are_reported_as_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The limit and the data are both smaller than in practice, by a factor of 256."""
     monkeypatch.setattr(arrow_decoder, "MOST_SPELLED", arrow_decoder.MOST_SPELLED // 256)
     path = tmp_path / "a.arrows"
@@ -329,9 +327,7 @@ def test_a_missing_directory_or_file_raises_an_error(tmp_path: Path, suffix: str
         open_recording(tmp_path / f"a{suffix}")
 
 
-def test_an_incomplete_batch_is_cut_off_before_the_next_batch_is_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_next_batch_replaces_an_incomplete_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """For a while, the simulated disk can neither write nor truncate files."""
     path = tmp_path / "a.arrows"
     with open_writer(path, METADATA) as writer:

@@ -247,9 +247,7 @@ def test_limits_abort_while_the_disk_hangs_and_all_rows_are_written_later(tmp_pa
     assert disk.written == ["phase", "output_current", "phase", "output_current", "closed"]
 
 
-def test_a_run_is_aborted_if_a_hanging_disk_loses_rows(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_is_aborted_if_a_hung_disk_loses_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(runner, "MOST_WAITING", 2)
     monkeypatch.setattr(runner, "ENDING_S", 0.01)
     disk = HangingWriter()
@@ -320,9 +318,7 @@ def test_no_step_is_carried_out_after_the_computer_has_slept(
 
 
 @pytest.mark.slow
-def test_a_run_is_not_ok_if_stopping_a_line_raises_an_error(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_is_not_ok_if_stopping_a_line_raises(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     original = Bus.stop_all
 
     def stop_all(bus: Bus) -> Any:
@@ -612,9 +608,7 @@ FAMILIES = [model for model in (*MODELS, *SHIPPED) if find_model(model).stop is 
 
 @pytest.mark.long
 @pytest.mark.parametrize("model", FAMILIES)
-def test_each_familys_first_stop_after_an_abort_comes_within_two_bus_cycles(
-    model: str, tmp_path: Path
-) -> None:
+def test_each_familys_first_stop_of_an_abort_comes_within_two_bus_cycles(model: str, tmp_path: Path) -> None:
     """The simulated drives count requests from the read of the high value to the first write, which is a
     stop.
     """
@@ -737,9 +731,7 @@ def test_no_motor_keeps_running_after_a_port_was_lost(seed: int, tmp_path: Path)
     found[0].__exit__(None, None, None)
 
 
-def test_a_simulation_speed_does_not_shorten_the_waits_of_other_threads(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_simulation_speed_does_not_shorten_waits_of_other_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     """Another thread of the process may ramp a real motor at the same time."""
     waits: list[float] = []
     monkeypatch.setattr(clock, "time", SimpleNamespace(**vars(time) | {"sleep": waits.append}))

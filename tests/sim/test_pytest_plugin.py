@@ -66,9 +66,7 @@ def test_pytest_plugin_simulates_each_line_of_a_plant_at_a_port_of_its_kind(
         simulated_plant(path, faults=Faults(drives={"hall-2": DriveFaults()}))
 
 
-def test_pytest_plugin_sets_values_of_a_simulated_line_by_name(
-    simulated_line: Callable[..., FaultyWire],
-) -> None:
+def test_pytest_plugin_sets_simulated_values_by_name(simulated_line: Callable[..., FaultyWire]) -> None:
     line = simulated_line(Toy(1), speed=50)
     line.drives[0]["output_frequency"] = 12.5
     with Bus(line.path) as bus:

@@ -235,9 +235,7 @@ def every_register() -> list[tuple[Register[float], int]]:
 
 
 @table(("register", "at"), every_register())
-def test_encoded_drive_returns_a_number_made_of_address_table_and_register(
-    register: Register[float], at: int
-) -> None:
+def test_encoded_number_is_made_of_address_table_and_register(register: Register[float], at: int) -> None:
     sim = EncodedDrive(Own(7))
     table, where = register.table, register.address + at
     numbers = {COIL: 1, DISCRETE: 2, HOLDING: 3, INPUT: 4}
@@ -309,9 +307,7 @@ def test_simulated_motor_has_no_voltage_until_it_is_run(motor: Motor) -> None:
         (100, 40, Phase.CONSTANT),
     ],
 )
-def test_simulated_motor_accelerates_along_its_ramp(
-    motor: Motor, now: float, frequency: float, phase: Phase
-) -> None:
+def test_simulated_motor_follows_its_ramp(motor: Motor, now: float, frequency: float, phase: Phase) -> None:
     motor.run()
     motor.run_to(now)
     assert motor.frequency == pytest.approx(frequency)

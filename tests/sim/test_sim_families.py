@@ -111,9 +111,7 @@ def test_simulated_erman_coils_are_read_as_printed(erman: Bench) -> None:
         (Message(1, 0x10, 0x58, 2, b"\x00\x00\x00\x00"), "01 90 03 0C 01"),
     ],
 )
-def test_simulated_erman_refuses_wrong_addresses_with_the_printed_reply(
-    erman: Bench, request_: Message, reply: str
-) -> None:
+def test_simulated_erman_refuses_addresses_as_printed(erman: Bench, request_: Message, reply: str) -> None:
     assert erman.send(build_request(Framing.RTU, request_)) == bytes.fromhex(reply)
 
 
@@ -219,9 +217,7 @@ def test_simulated_che_runs_in_reverse_at_a_negative_setpoint(che: Bench) -> Non
 
 
 @pytest.mark.parametrize(("word", "stopped_after"), [(5, False), (6, True), (8, False)])
-def test_simulated_che_ramps_down_at_a_stop_and_coasts_immediately(
-    che: Bench, word: int, stopped_after: bool
-) -> None:
+def test_simulated_che_ramps_down_at_a_stop_and_coasts(che: Bench, word: int, stopped_after: bool) -> None:
     che.write(0x2000, 10_000)
     che.write(0x1000, 2)
     che.wait(60)
@@ -251,9 +247,7 @@ def test_simulated_che_refuses_a_start_during_a_fault_until_a_reset(che: Bench) 
         ("01 04 30 00 00 01", "01 84 01"),
     ],
 )
-def test_simulated_che_refuses_invalid_requests_with_documented_exceptions(
-    che: Bench, body: str, reply: str
-) -> None:
+def test_simulated_che_refuses_requests_with_documented_exceptions(che: Bench, body: str, reply: str) -> None:
     assert che.send(checksums.rtu(body)) == checksums.rtu(reply)
 
 
@@ -505,9 +499,7 @@ def test_simulated_delixi_native_faults_show_the_printed_digits(
         (b":0102000205\r\n", b""),  # the request is too short
     ],
 )
-def test_simulated_delixi_native_sends_the_documented_error_replies(
-    native: Bench, frame: bytes, reply: bytes
-) -> None:
+def test_simulated_delixi_native_sends_documented_errors(native: Bench, frame: bytes, reply: bytes) -> None:
     assert native.send(frame) == reply
 
 
@@ -713,9 +705,7 @@ def test_preset_speed_bits_of_a_simulated_yd1000_select_the_speed(yd: Bench, bit
     ],
     ids=lambda each: f"{each:04X}",
 )
-def test_simulated_yd1000_refuses_values_beyond_the_documented_limits(
-    yd: Bench, address: int, value: int
-) -> None:
+def test_simulated_yd1000_refuses_values_beyond_its_limits(yd: Bench, address: int, value: int) -> None:
     before = yd.read(3, address)
     assert yd.write(address, value) == 3
     assert yd.read(3, address) == before
@@ -817,9 +807,7 @@ CONFIRMED = {  # Frames to which the reply is a copy. Those of InvtCHE and YD100
 
 
 @table(("make", "frame"), [(make, frame) for make, *frames in CONFIRMED.values() for frame in frames])
-def test_simulated_drive_confirms_a_write_with_a_copy_of_the_request(
-    make: Callable[[], Drive], frame: str
-) -> None:
+def test_simulated_drive_confirms_a_write_with_a_copy(make: Callable[[], Drive], frame: str) -> None:
     assert Bench(make()).exchange(frame) == frame
 
 

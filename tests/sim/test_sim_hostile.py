@@ -310,18 +310,14 @@ def test_invalid_faults_file_is_refused(text: str | None, sentence: str, tmp_pat
         load_faults(path)
 
 
-def test_help_of_the_simulate_command_lists_the_keys_of_a_faults_file(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_help_of_simulate_lists_the_keys_of_a_faults_file(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["simulate", "--help"]) == 0
     printed = capsys.readouterr().out
     keys = {*rates_of(Faults), *rates_of(DriveFaults), "seed", "late", "silence", "trip"}
     assert {name for name in keys if not re.search(rf"^  {name} = ", printed, re.MULTILINE)} == set()
 
 
-def test_simulate_command_reports_a_mistake_in_the_faults_file(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_simulate_reports_a_faults_file_mistake(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     plant, faults = tmp_path / "plant.toml", tmp_path / "faults.toml"
     plant.write_text(
         '[[line]]\nname = "a"\nport = "a"\n[[line.drive]]\nname = "b"\nmodel = "yd1000"\naddress = 1\n'

@@ -265,9 +265,7 @@ class IllDrive(EncodedDrive):
         raise Ill("of this drive")
 
 
-def test_simulated_drive_that_fails_sends_no_reply_and_other_lines_continue(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_simulated_drive_that_fails_does_not_disturb_other_lines(caplog: pytest.LogCaptureFixture) -> None:
     wires = [Wire([drive], unpaced=True) for drive in (IllDrive(Toy(1)), EncodedDrive(Toy(1)))]
     simulator = Simulator(wires)
 

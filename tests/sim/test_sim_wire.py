@@ -57,9 +57,7 @@ def test_each_simulated_byte_arrives_at_its_last_bit_or_slightly_later(baudrate:
 
 @table("family", [ErmanERG220, InvtCHE, InnovertIBD, DelixiModbus, YD1000])
 @table("extra", [b"\0", b"\x01\x03", b"\xff\xff\xff"])
-def test_simulated_drive_ignores_a_valid_frame_followed_by_more_bytes(
-    family: type[Drive], extra: bytes
-) -> None:
+def test_simulated_drive_ignores_a_frame_followed_by_more_bytes(family: type[Drive], extra: bytes) -> None:
     """The manuals allow no byte after the checksum (ERMAN, section 5; CHE, 11.5; YD1000, section 5)."""
     wire = Wire([simulated(family(1))])
     register = next(each for each in wire.drives[0].drive.readings() if each.step is not None)
@@ -83,9 +81,7 @@ def test_simulated_rtu_reply_waits_t3_5_even_with_a_shorter_response_delay() -> 
     ],
     ids=lambda each: getattr(each, "model", None),
 )
-def test_simulated_silence_before_a_reply_is_that_of_the_family(
-    drive: Drive, request_: str, silence: float
-) -> None:
+def test_simulated_silence_before_replies_is_the_familys(drive: Drive, request_: str, silence: float) -> None:
     wire = Wire([simulated(drive, response_delay=0.0)])
     wire.receive(checksums.rtu(request_), 0.0)
     character = drive.settings.character

@@ -144,9 +144,7 @@ def test_rts_switches_the_transceiver_to_sending_for_each_request(guest: Guest, 
 @pytest.mark.parametrize("mode", ["rts-up", "rts-down"])
 @pytest.mark.parametrize("baudrate", [9600, 38400, 115200])
 @USB
-def test_rts_never_changes_before_the_last_bit_has_left(
-    guest: Guest, kind: str, baudrate: int, mode: str
-) -> None:
+def test_rts_stays_until_the_last_bit_has_left(guest: Guest, kind: str, baudrate: int, mode: str) -> None:
     found = guest.run("rts", kind=kind, mode=mode, baudrate=baudrate, count=300)
     assert found["sent"] > 0
     assert found["missing"] == found["early"] == 0

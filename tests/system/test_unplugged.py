@@ -66,9 +66,7 @@ def test_adapters_that_exchange_their_tty_names_are_distinguished(guest: Guest, 
 @pytest.mark.parametrize(
     ("format", "kinds"), [("8E1", ["parity", "framing", "break"]), ("8N1", ["framing", "break"])]
 )
-def test_a_reply_with_an_error_flag_from_the_driver_is_a_bad_reply(
-    guest: Guest, format: str, kinds: list[str]
-) -> None:
+def test_a_reply_with_an_error_flag_is_a_bad_reply(guest: Guest, format: str, kinds: list[str]) -> None:
     found = guest.run("damaged_replies", format=format, kinds=kinds)
     for kind in kinds:
         assert found[kind].startswith("BadReply"), kind

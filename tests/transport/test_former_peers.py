@@ -95,9 +95,7 @@ def test_a_late_reply_on_a_reopened_port_is_not_polled_as_another_register(wire:
     assert values == {1.11}
 
 
-def test_late_replies_are_recognised_under_another_name_of_the_port(
-    wire: HoldingWire, tmp_path: Path
-) -> None:
+def test_late_replies_are_recognised_under_another_port_name(wire: HoldingWire, tmp_path: Path) -> None:
     link = tmp_path / "hall"
     link.symlink_to(wire.path)
     leave_a_reply_behind(wire, str(link))

@@ -81,9 +81,7 @@ def test_a_stalled_connection_is_closed_and_sends_nothing_later(monkeypatch: pyt
 
 
 @pytest.mark.parametrize("echo", ["auto", "on", "off"])
-def test_the_echo_option_is_kept_when_the_port_is_reopened(
-    echo: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_echo_option_is_kept_when_a_port_is_reopened(echo: str, monkeypatch: pytest.MonkeyPatch) -> None:
     told: list[Echo] = []
     monkeypatch.setattr(Port, "set_echo", lambda port, each: told.append(each))
     with Simulator([wire()]) as sim, Bus(sim.wires[0].path, echo=echo) as bus:
@@ -151,9 +149,7 @@ def test_a_port_is_set_to_low_latency_mode(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 @table("refusal", [ValueError, OSError, NotImplementedError, AttributeError])
-def test_a_port_without_low_latency_mode_is_opened(
-    monkeypatch: pytest.MonkeyPatch, refusal: type[Exception]
-) -> None:
+def test_low_latency_mode_is_optional(monkeypatch: pytest.MonkeyPatch, refusal: type[Exception]) -> None:
     def refuse(port: Serial, wanted: bool) -> None:
         raise refusal
 
@@ -386,9 +382,7 @@ def test_a_pyserial_port_that_cannot_be_set_up_raises_a_one_sentence_error() -> 
     assert "\n" not in str(caught.value)
 
 
-def test_closing_a_port_waits_until_another_thread_has_ended_its_exchanges(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_closing_a_port_waits_for_the_exchanges_of_another_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     closing: list[threading.Thread] = []
     end = Port.end
 

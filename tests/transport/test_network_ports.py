@@ -216,9 +216,7 @@ def test_a_pyserial_bridge_needs_no_socket_timestamps(monkeypatch: pytest.Monkey
     bridge.close()
 
 
-def test_a_pyserial_bridge_raises_os_error_if_no_thread_can_be_started(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_pyserial_bridge_raises_os_error_if_no_thread_can_start(monkeypatch: pytest.MonkeyPatch) -> None:
     started: list[threading.Thread] = []
     start = threading.Thread.start
 
@@ -388,9 +386,7 @@ def start_into_the_cut(bus: Bus, toy: Toy, network: FarNetwork) -> None:
 
 @pytest.mark.long
 @pyserials_own
-def test_a_start_sent_into_a_cut_network_never_arrives_after_the_port_is_closed(
-    far_network: FarNetwork,
-) -> None:
+def test_a_start_into_a_cut_network_never_arrives_after_the_port_is_closed(far_network: FarNetwork) -> None:
     with Bus(far_network.url, echo="off", expiry=PATIENCE) as bus:
         start_into_the_cut(bus, bus.attach(Toy, 1), far_network)
     taken = far_network.all_received()
@@ -401,9 +397,7 @@ def test_a_start_sent_into_a_cut_network_never_arrives_after_the_port_is_closed(
 @pytest.mark.slow
 @pyserials_own
 @pytest.mark.skipif(not hasattr(socket, "TCP_USER_TIMEOUT"), reason="this system knows no such time-out")
-def test_a_start_sent_into_a_cut_network_never_arrives_while_the_port_is_open(
-    far_network: FarNetwork,
-) -> None:
+def test_a_start_into_a_cut_network_never_arrives_while_the_port_is_open(far_network: FarNetwork) -> None:
     """The network is restored as soon as the call has returned."""
     with Bus(far_network.url, echo="off", expiry=PATIENCE) as bus:
         start_into_the_cut(bus, bus.attach(Toy, 1), far_network)

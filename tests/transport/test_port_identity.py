@@ -403,9 +403,7 @@ def test_a_command_that_a_stalled_port_does_not_send_is_not_logged_as_a_loss(
     assert "lost" not in caplog.text
 
 
-def test_ctrl_c_leaves_no_cancelled_command_in_the_serial_driver(
-    terminal: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ctrl_c_leaves_no_command_in_the_driver(terminal: str, monkeypatch: pytest.MonkeyPatch) -> None:
     found = Line(terminal).open()
 
     def interrupted(*given: object) -> None:
@@ -441,9 +439,7 @@ def test_the_error_for_a_silent_drive_behind_a_stalled_adapter_names_the_stall(
             toy.read(toy.output_current)
 
 
-def test_a_read_that_a_stalled_port_does_not_send_does_not_lose_the_port(
-    terminal: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_unsent_read_does_not_lose_a_stalled_port(terminal: str, monkeypatch: pytest.MonkeyPatch) -> None:
     held = SimpleNamespace(count=-1, result=Failure.STALLED, error=errno.ETIMEDOUT, raw=b"", reply=None)
     with Bus(terminal) as bus:
         toy = bus.attach(Toy, 1)
@@ -464,9 +460,7 @@ def test_a_read_that_a_stalled_port_does_not_send_does_not_lose_the_port(
         (38400, "its driver replaces 38400 baud by a custom divisor: setserial /dev/ttyS1 spd_normal"),
     ],
 )
-def test_an_impossible_baud_rate_is_refused_and_the_error_names_the_nearest_rates(
-    baudrate: int, sentence: str
-) -> None:
+def test_the_error_of_an_impossible_baud_rate_names_the_nearest_rates(baudrate: int, sentence: str) -> None:
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.setattr(port, "lib", SimpleNamespace(md_port_baud_base=lambda fd: 115200))
         found = OpenPort("/dev/ttyS1", TransactionIds.MATCH, RS485.OFF, None)

@@ -168,9 +168,7 @@ def test_repeated_reads_reuse_the_memory_of_their_result(bus: Bus, monkeypatch: 
     assert asked[:2] * 4 == asked
 
 
-def test_concurrent_reads_use_separate_memory_for_their_results(
-    bus: Bus, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_concurrent_reads_use_separate_memory_for_results(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
     drive = bus.attach(PatientToy, 1)
     value = drive.read(Toy.acceleration_time)
     both = Barrier(2)
@@ -335,9 +333,7 @@ def test_the_error_for_a_refused_request_names_the_refused_register() -> None:
 
 
 @given(st.sets(st.integers(0, 5), max_size=2), st.integers(1, 6), st.sets(st.integers(0, 5), min_size=1))
-def test_a_read_is_complete_or_names_the_refused_register(
-    refused: set[int], most: int, asked: set[int]
-) -> None:
+def test_a_read_is_whole_or_names_the_refused_register(refused: set[int], most: int, asked: set[int]) -> None:
     drive = family(6)(1, name="pump-1")
     bus = SimulatedBus(Picky(drive, refused, most)).bus
     bus.attach(drive)
@@ -352,9 +348,7 @@ def test_a_read_is_complete_or_names_the_refused_register(
 
 
 @pytest.mark.parametrize("code", [1, 5, 6])
-def test_a_request_that_the_drive_refuses_as_busy_is_not_split(
-    code: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_request_to_a_busy_drive_is_not_split(code: int, monkeypatch: pytest.MonkeyPatch) -> None:
     drive, sim, _ = picky()
     sim.limit = 0
     monkeypatch.setattr(sim, "_code", lambda reason: code)
@@ -517,9 +511,7 @@ def test_a_raw_read_with_a_count_that_is_not_a_number_raises(
 
 
 @pytest.mark.parametrize("function", [1, 2, 3, 4])
-def test_send_raw_rejects_read_functions_before_sending(
-    simulated: SimulatedBus, toy: Drive, function: int
-) -> None:
+def test_send_raw_rejects_read_functions(simulated: SimulatedBus, toy: Drive, function: int) -> None:
     """A read sent as a write would wait so long that a late reply to an earlier read could be accepted."""
     with pytest.raises(
         ValueError, match=rf"{function:02X}H is a read.*call drive.read_raw\({function}, 80, 2\)"

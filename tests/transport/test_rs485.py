@@ -95,9 +95,7 @@ def play(driver: Path, mode: str, reads: int, **variables: object) -> tuple[list
 @pytest.mark.parametrize(
     ("mode", "sending", "receiving"), [("rts-up", "up", "down"), ("rts-down", "down", "up")]
 )
-def test_rts_switches_to_sending_only_while_a_request_is_sent(
-    driver: Path, mode: str, sending: str, receiving: str
-) -> None:
+def test_rts_switches_only_while_sending(driver: Path, mode: str, sending: str, receiving: str) -> None:
     read, events = play(driver, mode, 20)
     assert len(read) == 20
     writes = [at for at, event in enumerate(events) if event.what == "write"]
@@ -201,9 +199,7 @@ def test_rs485_is_read_from_a_plant_file(tmp_path: Path) -> None:
         ("socket://10.0.0.7:4001", '"kernel"', "socket://10.0.0.7:4001 is not one, so remove rs485"),
     ],
 )
-def test_an_invalid_line_option_is_reported_as_one_mistake(
-    tmp_path: Path, port: str, value: str, sentence: str
-) -> None:
+def test_an_invalid_line_option_is_one_mistake(tmp_path: Path, port: str, value: str, sentence: str) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(PLANT.format(port, value))
     with pytest.raises(PlantError) as wrong:

@@ -68,9 +68,7 @@ def test_without_replies_the_delays_are_0() -> None:
     assert (found.replies, found.p50, found.p99, found.longest) == (0, 0, 0, 0)
 
 
-def test_a_delay_is_the_drives_response_time_without_the_time_on_the_wire(
-    line: LineDriver, drive: Peer
-) -> None:
+def test_a_delay_is_the_response_time_without_the_time_on_the_wire(line: LineDriver, drive: Peer) -> None:
     for delay in (10, 10, 10, 15):
         answer(line, drive, delay * MS)
     found = Statistics(1.0, drive.counters()).delays
@@ -79,18 +77,14 @@ def test_a_delay_is_the_drives_response_time_without_the_time_on_the_wire(
 
 
 @pytest.mark.parametrize("delay_ms", [0, 3, 20])
-def test_utilisation_includes_characters_response_delays_and_silences(
-    line: LineDriver, drive: Peer, delay_ms: int
-) -> None:
+def test_utilisation_includes_delays_and_silences(line: LineDriver, drive: Peer, delay_ms: int) -> None:
     for _ in range(10):
         answer(line, drive, delay_ms * MS)
     characters = (8 + 7) * CHARACTER
     assert drive.counters().ideal_ns == pytest.approx(10 * (characters + delay_ms * MS + SILENCE), rel=0.1)
 
 
-def test_the_utilisation_of_a_port_faster_than_its_settings_is_at_most_1(
-    line: LineDriver, drive: Peer
-) -> None:
+def test_the_utilisation_of_a_port_above_its_baud_rate_is_at_most_1(line: LineDriver, drive: Peer) -> None:
     """The whole reply comes after 0.1 ms; on a wire it would take the time of 15 characters."""
     begun = line.now
     for _ in range(100):
@@ -134,9 +128,7 @@ def counted(known: Peer) -> Counter[str]:
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
-def test_each_outcome_is_counted_in_the_counters_of_the_modbus_guide(
-    line: LineDriver, drive: Peer, ending: str
-) -> None:
+def test_each_outcome_is_counted_as_in_the_modbus_guide(line: LineDriver, drive: Peer, ending: str) -> None:
     request, received, expected = ENDINGS[ending]
     line.echo = lib.MD_NO_ECHO
     ask(line, drive, request)

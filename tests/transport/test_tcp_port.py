@@ -124,9 +124,7 @@ def test_an_attached_drive_uses_the_framing_of_its_port(port: str) -> None:
         (DelixiNative(1), "does not speak Modbus, and a tcp:// port such as tcp://.* carries nothing else"),
     ],
 )
-def test_a_drive_with_another_framing_on_a_tcp_port_raises_a_one_sentence_error(
-    port: str, drive: Drive, sentence: str
-) -> None:
+def test_another_framing_on_a_tcp_port_raises_one_sentence(port: str, drive: Drive, sentence: str) -> None:
     with Bus(port) as bus, pytest.raises(ValueError, match=sentence):
         bus.attach(drive)
 

@@ -278,9 +278,7 @@ sys.exit(multidrop.cli.main(sys.argv[1:]))
 """
 
 
-def test_ctrl_c_during_a_start_reports_sent_frames_and_the_stop_command(
-    wine: Wine, pump: MotorDrive, tmp_path: Path
-) -> None:
+def test_ctrl_c_during_a_start_reports_sent_frames(wine: Wine, pump: MotorDrive, tmp_path: Path) -> None:
     """The test types the printed stop command, which stops the motor."""
     vars(pump.motor)["run"] = lambda direction=None: None
     received = ReceivedRequests(pump)

@@ -111,9 +111,7 @@ def test_family_file_gives_the_same_values_as_the_equivalent_class(plant: Path) 
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.usefixtures("_unpainted")
-def test_plant_with_two_family_files_is_scanned_recorded_and_reported(
-    run: Run, plant: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_plant_with_two_family_files_works(run: Run, plant: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(plant.parent)
     lines = Plant.load(plant).lines
     drives = [simulated(polled.drive) for polled in lines[0].drives]
@@ -148,7 +146,7 @@ def test_plant_with_two_family_files_is_scanned_recorded_and_reported(
 
 
 @pytest.mark.parametrize(("name", "value"), [("light", "1"), ("ramp", "1"), ("run", "off")])
-def test_unconfirmed_family_file_with_commands_writes_only_harmless_raw_counts(
+def test_unconfirmed_family_file_writes_only_harmless_counts(
     pump: type[Drive], name: str, value: str
 ) -> None:
     """Without a stop verb, even the declared harmless raw counts are not sent, because they are untested."""
@@ -203,9 +201,7 @@ def test_family_file_without_commands_needs_no_confirmation(plant: Path) -> None
         ("above = 5\nbelow = 7", 7, False),
     ],
 )
-def test_identify_section_recognises_drives_by_their_register_values(
-    tmp_path: Path, proof: str, value: int, is_one: bool
-) -> None:
+def test_identify_section_recognises_drives(tmp_path: Path, proof: str, value: int, is_one: bool) -> None:
     path = tmp_path / "meter.toml"
     head = '[family]\ntitle = "Meter"\nmanual = "M"\ncounts_from = 0\n[reading]\ndevice = { at = 3 }\n'
     path.write_text(f'{head}[[identify]]\nregister = "device"\n{proof}\n')

@@ -268,7 +268,7 @@ DEVICE = HEAD + "[reading]\ndevice = { at = 3 }\nspeed = { at = 4, unit = 'Hz', 
         ),
     ],
 )
-def test_mistakes_in_the_family_file_sections_identify_and_verb_are_reported(
+def test_mistakes_in_identify_and_verb_are_reported(
     tmp_path: Path, section: str, mistakes: list[str]
 ) -> None:
     first, rest = ("", DEVICE + section) if section.startswith("[") else (section + "\n", DEVICE)
@@ -361,9 +361,7 @@ WRONG_FILES = [  # each text is a whole family file with a mistake
         *WRONG_FILES,
     ],
 )
-def test_mistake_in_a_family_file_is_reported_with_file_and_line(
-    tmp_path: Path, text: str, expected: str
-) -> None:
+def test_mistake_in_a_family_file_is_reported_with_its_line(tmp_path: Path, text: str, expected: str) -> None:
     found = mistakes(tmp_path, text)
     assert any(expected in mistake for mistake in found), found
 
@@ -400,9 +398,7 @@ def test_mistake_in_a_family_file_is_reported_with_file_and_line(
         (b"name,at\n\na b,1\n", "c.csv: line 3, a b: 'a b' cannot be a register's name"),
     ],
 )
-def test_mistake_in_a_csv_register_table_is_reported_with_its_line(
-    tmp_path: Path, data: bytes, expected: str
-) -> None:
+def test_mistake_in_a_csv_table_is_reported_with_its_line(tmp_path: Path, data: bytes, expected: str) -> None:
     (tmp_path / "c.csv").write_bytes(data)
     found = mistakes(tmp_path, HEAD + 'registers = ["c.csv"]\n')
     assert any(expected in mistake for mistake in found), found
@@ -481,9 +477,7 @@ def test_family_file_can_declare_text_registers(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_mistakes_in_text_registers_of_a_family_file_are_reported(
-    tmp_path: Path, entry: str, expected: str
-) -> None:
+def test_mistakes_in_text_registers_are_reported(tmp_path: Path, entry: str, expected: str) -> None:
     found = mistakes(tmp_path, HEAD + "[text]\n" + entry + "\n")
     assert any(expected in mistake for mistake in found), found
 
@@ -522,9 +516,7 @@ def test_parameters_section_of_a_family_file_gives_the_address_rule(tmp_path: Pa
         ('groups = [{ code = "P", at = 0, count = 2 }]\nfirmware = "x"', "firmware = 'x' is not a register"),
     ],
 )
-def test_mistakes_in_the_parameters_section_of_a_family_file_are_reported(
-    tmp_path: Path, rule: str, expected: str
-) -> None:
+def test_mistakes_in_the_parameters_section_are_reported(tmp_path: Path, rule: str, expected: str) -> None:
     text = f"{HEAD}[reading]\na = {{ at = 1 }}\n[parameters]\n{rule}\n"
     assert any(expected in mistake for mistake in mistakes(tmp_path, text))
 

@@ -374,9 +374,7 @@ OF_ANOTHER = {
 
 @table("first", OF_ANOTHER)
 @table("second", OF_ANOTHER)
-def test_stop_is_withheld_only_if_status_and_a_second_value_show_another_make(
-    first: str, second: str
-) -> None:
+def test_stop_is_withheld_only_if_two_values_show_another_make(first: str, second: str) -> None:
     """One make's stop word may run another make's motor. One value, or two settings, prove nothing."""
     line = Line("abb-acs355")
     shown = {line.drive.register(name).address: OF_ANOTHER[name] for name in (first, second)}

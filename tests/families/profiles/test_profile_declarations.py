@@ -194,9 +194,7 @@ STRANGERS: list[tuple[str, dict[str, Any], str]] = [
 
 
 @table(("model", "says", "sentence"), STRANGERS)
-def test_identify_refuses_a_drive_with_values_of_another_family(
-    model: str, says: dict[str, Any], sentence: str
-) -> None:
+def test_identify_refuses_values_of_another_family(model: str, says: dict[str, Any], sentence: str) -> None:
     with pytest.raises(WriteForbidden, match=sentence):
         identify(model, **says)
 

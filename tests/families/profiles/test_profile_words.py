@@ -304,9 +304,7 @@ def test_start_of_an_invt_drive_after_a_jog_requires_a_stop() -> None:
         ([ATV_OFF, ATV_READY], ("00 06", "00 07"), "not switched on"),
     ],
 )
-def test_start_of_a_cia402_drive_waits_for_each_state(
-    status: list[int], words: tuple[str, ...], sentence: str
-) -> None:
+def test_cia402_start_waits_for_each_state(status: list[int], words: tuple[str, ...], sentence: str) -> None:
     found = wire("schneider-atv320", status)
     with pytest.raises(NotVerified, match=sentence):
         found.drive.start()
@@ -375,9 +373,7 @@ def test_verbs_whose_control_word_a_family_omits_are_unsupported() -> None:
         ({**EXCHANGED, "stop": 0x10000}, "control: STOP = 65536 is not within 0 to 65535"),
     ],
 )
-def test_invalid_control_word_numbers_of_a_family_are_reported(
-    words: Mapping[str, int], mistake: str
-) -> None:
+def test_invalid_control_words_of_a_family_are_reported(words: Mapping[str, int], mistake: str) -> None:
     with pytest.raises(DeclarationError) as wrong:
         type("Wrong", (Goodrive,), {"control": numbered(words)})
     assert any(each.startswith(mistake) for each in wrong.value.mistakes)
