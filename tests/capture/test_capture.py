@@ -39,6 +39,8 @@ from multidrop.polling.batch import Row
 from multidrop.recording import RecordingError
 from multidrop.sim import EncodedDrive, Simulator, Wire, proof
 
+Captured = tuple[Path, Path, list[Row]]
+
 READ = bytes.fromhex("01 03 00 16 00 01 65 CE")
 
 
@@ -324,7 +326,7 @@ def test_unit_id_0_of_modbus_tcp_is_not_a_broadcast() -> None:
 
 
 @pytest.fixture
-def captured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path, list[Row]]:
+def captured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Captured:
     """Return a plant file, the capture of its poll with one silent drive, and the poll's rows.
 
     The drive that answers has a long timeout, so that no reply comes too late on a busy machine.
@@ -360,7 +362,7 @@ def captured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Pat
 
 
 @pytest.mark.long
-def test_wireshark_decodes_modbus_tcp(captured: tuple[Path, Path, list[Row]]) -> None:
+def test_wireshark_decodes_modbus_tcp(captured: Captured) -> None:
     _, path, rows = captured
     fields = [word for field in FIELDS for word in ("-e", field)]
     command = [require_program("tshark"), "-n", "-r", str(path), "-T", "fields", "-e", "_ws.col.Info"]
@@ -377,9 +379,7 @@ def test_wireshark_decodes_modbus_tcp(captured: tuple[Path, Path, list[Row]]) ->
 
 
 @pytest.mark.slow
-def test_a_decoded_capture_of_modbus_tcp_has_the_polled_values(
-    captured: tuple[Path, Path, list[Row]],
-) -> None:
+def test_a_decoded_capture_of_modbus_tcp_has_the_polled_values(captured: Captured) -> None:
     plant, path, polled = captured
     known = load_plant(plant)
     with Capture(path) as capture:

@@ -210,9 +210,7 @@ def epoch(time_ns: int) -> str:
 @pytest.mark.parametrize(
     "make", [pytest.param(rough_wires, id="rough"), pytest.param(echoing_wires, id="echoing")]
 )
-def test_a_disturbed_lines_capture_has_the_polled_rows(
-    tmp_path: Path, make: Callable[[], list[Wire]]
-) -> None:
+def test_a_disturbed_lines_capture_has_polled_rows(tmp_path: Path, make: Callable[[], list[Wire]]) -> None:
     drives = [polled(drive, drive.readings()) for drive in fast_drives()]
     rows, decoded = captured(tmp_path / "a.pcapng", make, drives, FATES)
     check(rows, decoded)
@@ -335,9 +333,7 @@ def seconds_in(path: Path) -> list[int]:
         ]
 
 
-def test_the_recorder_saves_traffic_around_an_anomaly(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_recorder_saves_traffic_around_an_anomaly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     one_flight = Flight(tmp_path / "flights", monkeypatch, seconds=20)
     one_flight.pass_(50)
     assert one_flight.recorder.written == []

@@ -189,9 +189,7 @@ def test_a_reply_is_in_doubt_if_it_may_answer_another_request(line: LineDriver, 
 
 
 @pytest.mark.usefixtures("proof")
-def test_no_reply_is_in_doubt_once_a_proof_is_answered(
-    line: LineDriver, drive: Peer, proof: Exchange
-) -> None:
+def test_no_reply_is_in_doubt_after_an_answered_proof(line: LineDriver, drive: Peer, proof: Exchange) -> None:
     line.send(proof)
     line.receive(PROOF_REPLY)
     assert has_sure_reply(line, drive)

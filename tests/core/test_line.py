@@ -758,9 +758,7 @@ def test_a_delixi_value_of_0_ends_the_exchange_if_it_is_due(line: LineDriver, st
 
 
 @pytest.mark.parametrize("insists", [False, True])
-def test_a_copy_that_may_be_an_echo_ends_at_the_timeout(
-    line: LineDriver, steady: Peer, insists: bool
-) -> None:
+def test_a_copy_that_may_be_an_echo_ends_at_timeout(line: LineDriver, steady: Peer, insists: bool) -> None:
     """The copy came too early for a reply, or the read has `insists`, which ignores arrival times."""
     make_steady(line, steady)
     end = send_query(line, steady, insists=insists)

@@ -16,6 +16,8 @@ from multidrop.families import InnovertIBD
 from multidrop.modbus_device import ModbusDevice
 from multidrop.sim import SimulatedDrive
 
+BusAndDevice = tuple[SimulatedBus, ModbusDevice]
+
 
 class Device(Drive):
     """A family that declares the simulated device's registers."""
@@ -29,12 +31,12 @@ class Device(Drive):
 
 
 @pytest.fixture
-def meter() -> tuple[SimulatedBus, ModbusDevice]:
+def meter() -> BusAndDevice:
     line = SimulatedBus(SimulatedDrive(Device(7)))
     return line, line.attach(ModbusDevice(7, name="meter"))
 
 
-def test_modbus_device_reads_numbers_of_any_format(meter: tuple[SimulatedBus, ModbusDevice]) -> None:
+def test_modbus_device_reads_numbers_of_any_format(meter: BusAndDevice) -> None:
     line, device = meter
     sim = line.sims[0]
     sim["first"], sim["second"] = 12, 65535
@@ -48,9 +50,7 @@ def test_modbus_device_reads_numbers_of_any_format(meter: tuple[SimulatedBus, Mo
         device.read_input(0, format="F32")
 
 
-def test_modbus_device_returns_coils_and_discrete_inputs_as_bool(
-    meter: tuple[SimulatedBus, ModbusDevice],
-) -> None:
+def test_modbus_device_returns_coils_and_discrete_inputs_as_bool(meter: BusAndDevice) -> None:
     line, device = meter
     line.sims[0]["door"] = 1
     assert device.read_discrete(4)[0] is True
@@ -59,9 +59,7 @@ def test_modbus_device_returns_coils_and_discrete_inputs_as_bool(
     assert line.sims[0]["lamp"] == 1
 
 
-def test_modbus_device_refuses_writes_without_the_argument_confirm(
-    meter: tuple[SimulatedBus, ModbusDevice],
-) -> None:
+def test_modbus_device_refuses_writes_without_the_argument_confirm(meter: BusAndDevice) -> None:
     line, device = meter
     for write in (
         lambda: device.write_holding(5, [1, 2]),
@@ -73,9 +71,7 @@ def test_modbus_device_refuses_writes_without_the_argument_confirm(
     assert line.frames == []
 
 
-def test_modbus_device_reads_back_the_registers_that_it_wrote(
-    meter: tuple[SimulatedBus, ModbusDevice],
-) -> None:
+def test_modbus_device_reads_back_the_registers_that_it_wrote(meter: BusAndDevice) -> None:
     line, device = meter
     assert device.write_holding(5, [7], confirm=True) == [7]
     assert device.write_holding(5, [1, 2], confirm=True) == [1, 2]
@@ -83,18 +79,14 @@ def test_modbus_device_reads_back_the_registers_that_it_wrote(
     assert [request.function for request, _ in line.frames] == [6, 3, 16, 3]
 
 
-def test_argument_multiple_writes_one_number_with_function_10h(
-    meter: tuple[SimulatedBus, ModbusDevice],
-) -> None:
+def test_argument_multiple_writes_one_number_with_function_10h(meter: BusAndDevice) -> None:
     line, device = meter
     assert device.write_holding(5, [7], confirm=True, multiple=True) == [7]
     assert device.write_coils(3, [True], confirm=True, multiple=True) == [True]
     assert [request.function for request, _ in line.frames] == [16, 3, 15, 1]
 
 
-def test_mask_write_changes_only_the_bits_that_are_0_in_the_and_mask(
-    meter: tuple[SimulatedBus, ModbusDevice],
-) -> None:
+def test_mask_write_changes_only_the_bits_that_are_0_in_the_and_mask(meter: BusAndDevice) -> None:
     line, device = meter
     held = ["12 34"]
     answers = {0x16: "07 16 00 05 FF F0 00 04", 3: "07 03 02 "}
@@ -111,9 +103,7 @@ def test_mask_write_changes_only_the_bits_that_are_0_in_the_and_mask(
         device.mask_holding(5, 65536, 0, confirm=True)
 
 
-def test_mask_write_is_unconfirmed_if_the_register_cannot_be_read(
-    meter: tuple[SimulatedBus, ModbusDevice],
-) -> None:
+def test_mask_write_is_unconfirmed_if_the_register_cannot_be_read(meter: BusAndDevice) -> None:
     line, device = meter
     answers = {0x16: "07 16 00 05 FF F0 00 04", 3: "07 83 02"}
     line.answers = lambda request: rtu(answers[request.function])
@@ -123,9 +113,7 @@ def test_mask_write_is_unconfirmed_if_the_register_cannot_be_read(
         device.mask_holding(5, 0xFFF0, 0x0004, confirm=True)
 
 
-def test_device_identification_in_two_replies_is_returned_whole(
-    meter: tuple[SimulatedBus, ModbusDevice],
-) -> None:
+def test_device_identification_in_two_replies_is_returned_whole(meter: BusAndDevice) -> None:
     line, device = meter
     parts = {0: "07 2B 0E 01 01 FF 01 01 00 04 41 63 6D 65", 1: "07 2B 0E 01 01 00 00 01 01 04 50 43 2D 31"}
     line.answers = lambda request: rtu(parts[request.data[2]])
@@ -133,9 +121,7 @@ def test_device_identification_in_two_replies_is_returned_whole(
     assert [request.data.hex() for request, _ in line.frames] == ["0e0100", "0e0101"]
 
 
-def test_write_that_modbus_device_cannot_read_back_is_unconfirmed(
-    meter: tuple[SimulatedBus, ModbusDevice],
-) -> None:
+def test_write_that_modbus_device_cannot_read_back_is_unconfirmed(meter: BusAndDevice) -> None:
     """The reply to a write is a copy of the request, so it may be an RS-485 adapter's echo."""
     line, device = meter
     line.loses = lambda request: request.function == 3
@@ -144,7 +130,7 @@ def test_write_that_modbus_device_cannot_read_back_is_unconfirmed(
 
 
 def test_write_that_reads_back_another_number_raises_not_verified(
-    meter: tuple[SimulatedBus, ModbusDevice], monkeypatch: pytest.MonkeyPatch
+    meter: BusAndDevice, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     line, device = meter
     monkeypatch.setattr(line.sims[0], "write", lambda function, start, raws: None)
@@ -164,7 +150,7 @@ def test_write_that_reads_back_another_number_raises_not_verified(
     ],
 )
 def test_written_number_that_does_not_fit_its_format_is_refused(
-    meter: tuple[SimulatedBus, ModbusDevice], values: list[float], format: str, sentence: str
+    meter: BusAndDevice, values: list[float], format: str, sentence: str
 ) -> None:
     line, device = meter
     with pytest.raises(ValueError, match=sentence):
@@ -172,16 +158,12 @@ def test_written_number_that_does_not_fit_its_format_is_refused(
     assert line.frames == []
 
 
-def test_modbus_device_raises_drive_exception_for_a_refused_address(
-    meter: tuple[SimulatedBus, ModbusDevice],
-) -> None:
+def test_modbus_device_raises_drive_exception_for_a_refused_address(meter: BusAndDevice) -> None:
     with pytest.raises(DriveException, match="illegal address"):
         meter[1].read_holding(5000)
 
 
-def test_modbus_device_reads_many_registers_in_several_requests(
-    meter: tuple[SimulatedBus, ModbusDevice],
-) -> None:
+def test_modbus_device_reads_many_registers_in_several_requests(meter: BusAndDevice) -> None:
     line, device = meter
     line.answers = lambda request: rtu(f"07 03 {2 * request.count:02X}" + " 00" * (2 * request.count))
     assert device.read_holding(0, 300) == [0] * 300
@@ -205,17 +187,18 @@ class Tank(Drive):
     lamp = setting(4, table=COIL, moves=False)
 
 
+BusAndTank = tuple[SimulatedBus, Tank]
+
+
 @pytest.fixture
-def metered() -> tuple[SimulatedBus, Tank]:
+def metered() -> BusAndTank:
     sim = SimulatedDrive(Tank(1, name="tank"))
     sim["level"], sim["flow"], sim["limit"], sim["serial"] = 2.5, 7, 4.0, "AB12"
     line = SimulatedBus(sim)
     return line, line.attach(Tank(1, name="tank"))
 
 
-def test_read_of_one_register_returns_its_value_and_of_several_a_dict(
-    metered: tuple[SimulatedBus, Tank],
-) -> None:
+def test_read_of_one_register_returns_its_value_and_of_several_a_dict(metered: BusAndTank) -> None:
     line, tank = metered
     assert tank.read(tank.level) == tank.read("level") == 2.5
     sent = len(line.frames)
@@ -227,22 +210,20 @@ def test_read_of_one_register_returns_its_value_and_of_several_a_dict(
     assert tank.read_all() == {"level": 2.5, "flow": 7, "door": False}
 
 
-def test_requests_for_the_same_registers_are_planned_only_once(
-    metered: tuple[SimulatedBus, Tank], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_equal_requests_are_planned_only_once(metered: BusAndTank, monkeypatch: pytest.MonkeyPatch) -> None:
     _, tank = metered
     tank.read("level", "flow")
     monkeypatch.delattr(Drive, "register")
     assert tank.read("level", "flow") == {"level": 2.5, "flow": 7}
 
 
-def test_text_registers_are_read_by_name_like_other_registers(metered: tuple[SimulatedBus, Tank]) -> None:
+def test_text_registers_are_read_by_name_like_other_registers(metered: BusAndTank) -> None:
     _, tank = metered
     assert tank.read(tank.serial) == tank.read("serial") == "AB12"
     assert tank.read("serial", tank.level) == {"serial": "AB12", "level": 2.5}
 
 
-def test_declared_coils_and_discrete_inputs_are_returned_as_bool(metered: tuple[SimulatedBus, Tank]) -> None:
+def test_declared_coils_and_discrete_inputs_are_returned_as_bool(metered: BusAndTank) -> None:
     line, tank = metered
     line.sims[0]["door"] = 1
     assert tank.read("door") is True
@@ -252,7 +233,7 @@ def test_declared_coils_and_discrete_inputs_are_returned_as_bool(metered: tuple[
     assert line.sims[0]["lamp"] == 1
 
 
-def test_setting_is_written_by_its_name(metered: tuple[SimulatedBus, Tank]) -> None:
+def test_setting_is_written_by_its_name(metered: BusAndTank) -> None:
     line, tank = metered
     assert tank.write("limit", 6.5) == tank.read(tank.limit) == line.sims[0]["limit"] == 6.5
     with pytest.raises(ValueError, match="has no register 'limits'; did you mean limit"):

@@ -97,9 +97,7 @@ def test_no_command_is_sent_to_a_drive_of_another_make(declared: str, there: str
 @pytest.mark.parametrize("turns", usually(True, False), ids=["turning", "at rest"])
 @every_declaration
 @table("there", THERE)
-def test_stop_never_runs_another_makes_motor_or_succeeds_while_it_turns(
-    declared: str, turns: bool, there: str
-) -> None:
+def test_stop_runs_no_other_make_nor_succeeds_while_it_turns(declared: str, turns: bool, there: str) -> None:
     if declared == there or same_words(declared, there):
         return
     pair = Pair(declared, there, turns)

@@ -45,6 +45,8 @@ from multidrop.recording.format import AppendFile
 from multidrop.sim import Simulator, Wire, simulated
 from multidrop.transport import clock
 
+Writers = Callable[..., HistoryWriter]
+
 NAMES = Names(["pump-1", "pump-2"])
 
 
@@ -54,7 +56,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def writers() -> Iterator[Callable[..., HistoryWriter]]:
+def writers() -> Iterator[Writers]:
     made: list[HistoryWriter] = []
 
     def make(folder: Path, **how: float) -> HistoryWriter:
@@ -70,9 +72,7 @@ def some(number: int, drive: int = 0) -> object:
     return batch(NAMES, drive, range(number * 20, number * 20 + 20), NOON, SECOND)
 
 
-def test_closing_a_history_writer_writes_all_rows(
-    tmp_path: Path, writers: Callable[..., HistoryWriter]
-) -> None:
+def test_closing_a_history_writer_writes_all_rows(tmp_path: Path, writers: Writers) -> None:
     writer = writers(tmp_path / "new" / "history")
     taken = [some(number, number % 2) for number in range(50)]
     for one in taken:
@@ -87,7 +87,7 @@ def test_closing_a_history_writer_writes_all_rows(
     assert writer.state().dropped == 20
 
 
-def test_batches_of_two_pollers_are_recorded(tmp_path: Path, writers: Callable[..., HistoryWriter]) -> None:
+def test_batches_of_two_pollers_are_recorded(tmp_path: Path, writers: Writers) -> None:
     """In the batches of the two pollers, the same code stands for different names."""
     writer = writers(tmp_path)
     taken = [
@@ -100,9 +100,7 @@ def test_batches_of_two_pollers_are_recorded(tmp_path: Path, writers: Callable[.
         assert rows_in(history) == [row for one in taken for row in one]
 
 
-def test_the_writer_copies_rows_out_of_the_cores_memory(
-    tmp_path: Path, writers: Callable[..., HistoryWriter]
-) -> None:
+def test_the_writer_copies_rows_out_of_the_cores_memory(tmp_path: Path, writers: Writers) -> None:
     """Rows are copied, because the core reuses a batch's memory."""
     writer = writers(tmp_path)
     one = some(0)
@@ -116,7 +114,7 @@ def test_the_writer_copies_rows_out_of_the_cores_memory(
         assert rows_in(history) == expected
 
 
-def test_a_changed_plant_starts_a_new_segment(tmp_path: Path, writers: Callable[..., HistoryWriter]) -> None:
+def test_a_changed_plant_starts_a_new_segment(tmp_path: Path, writers: Writers) -> None:
     writer = writers(tmp_path)
     writer.take(some(0))
     until(lambda: writer.state().rows == 20)
@@ -133,7 +131,7 @@ def test_a_changed_plant_starts_a_new_segment(tmp_path: Path, writers: Callable[
 
 def test_a_full_disk_is_reported_and_recording_continues(
     tmp_path: Path,
-    writers: Callable[..., HistoryWriter],
+    writers: Writers,
     caplog: pytest.LogCaptureFixture,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -161,7 +159,7 @@ def test_a_full_disk_is_reported_and_recording_continues(
 
 
 def test_a_hanging_disk_delays_no_polling(
-    tmp_path: Path, writers: Callable[..., HistoryWriter], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, writers: Writers, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(writer_module, "MOST_WAITING", 200)
     is_hanging, goes_on = threading.Event(), threading.Event()
@@ -185,9 +183,7 @@ def test_a_hanging_disk_delays_no_polling(
 
 
 @pytest.mark.long
-def test_a_full_disk_delays_neither_polling_nor_stops(
-    tmp_path: Path, writers: Callable[..., HistoryWriter]
-) -> None:
+def test_a_full_disk_delays_neither_polling_nor_stops(tmp_path: Path, writers: Writers) -> None:
     writer = writers(tmp_path / "history")
     with Simulator([Wire([simulated(InnovertIBD(address=1))])]) as line:
         (tmp_path / "plant.toml").write_text(
@@ -208,16 +204,14 @@ def test_an_unwritable_folder_raises_permission_error_immediately() -> None:
         HistoryWriter(directory / "history", METADATA)
 
 
-def test_only_one_process_records_into_a_history(
-    tmp_path: Path, writers: Callable[..., HistoryWriter]
-) -> None:
+def test_only_one_process_records_into_a_history(tmp_path: Path, writers: Writers) -> None:
     writers(tmp_path)
     with pytest.raises(ValueError, match="is being recorded by another process"):
         HistoryWriter(tmp_path, METADATA)
 
 
 def test_an_exception_in_the_history_writers_thread_does_not_end_it(
-    tmp_path: Path, writers: Callable[..., HistoryWriter], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, writers: Writers, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def wrong(*_: object) -> object:
         raise RuntimeError("a mistake")
@@ -236,9 +230,7 @@ def test_an_exception_in_the_history_writers_thread_does_not_end_it(
 
 
 @pytest.mark.long
-def test_closed_segments_are_compacted_and_old_files_removed(
-    tmp_path: Path, writers: Callable[..., HistoryWriter]
-) -> None:
+def test_closed_segments_are_compacted_and_old_files_removed(tmp_path: Path, writers: Writers) -> None:
     pytest.importorskip("duckdb", reason="needs duckdb")
     begin = time.time_ns() - 10 * DAY
     record(tmp_path, [random_rows(number, begin + number * DAY, 20) for number in range(4)])
@@ -253,7 +245,7 @@ def test_closed_segments_are_compacted_and_old_files_removed(
 
 
 def test_the_oldest_files_beyond_the_size_are_removed(
-    tmp_path: Path, writers: Callable[..., HistoryWriter], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, writers: Writers, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("rows", "tens", "damaged"):
         (tmp_path / name).mkdir()
@@ -275,7 +267,7 @@ def test_the_oldest_files_beyond_the_size_are_removed(
 @pytest.mark.long
 def test_a_failed_compaction_is_reported_and_started_again(
     tmp_path: Path,
-    writers: Callable[..., HistoryWriter],
+    writers: Writers,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:

@@ -292,9 +292,7 @@ def test_yaml_that_is_costly_or_unsafe_to_read_is_refused(tmp_path: Path, text: 
         read_devices(tmp_path / "a.yaml")
 
 
-def test_registers_above_a_familys_limit_are_reported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_registers_above_the_limit_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Entries above the limit are not checked, because that would be slow for a large file."""
     declared: list[str] = []
 
@@ -327,9 +325,7 @@ def test_registers_above_a_familys_limit_are_reported(
         ("a.xls", "a", "its suffix is not one of .csv"),
     ],
 )
-def test_file_that_is_not_a_register_table_is_refused(
-    tmp_path: Path, name: str, text: str, expected: str
-) -> None:
+def test_file_without_registers_is_refused(tmp_path: Path, name: str, text: str, expected: str) -> None:
     path = tmp_path / name
     path.write_text(text)
     with pytest.raises(ValueError, match=re.escape(expected)):

@@ -179,9 +179,7 @@ def test_names_of_values_with_numbers_as_text_are_imported(tmp_path: Path) -> No
         ({"format": "string8", "word_order": "little_endian"}, "a text whose word_order is little_endian"),
     ],
 )
-def test_wb_mqtt_text_in_an_unsupported_order_is_reported_as_not_imported(
-    tmp_path: Path, keys: dict[str, Any], reason: str
-) -> None:
+def test_wb_mqtt_text_in_unknown_order_is_reported(tmp_path: Path, keys: dict[str, Any], reason: str) -> None:
     with pytest.raises(ValueError, match=f"a: {reason}"):
         channel(tmp_path, string_data_size=8, **keys)
 

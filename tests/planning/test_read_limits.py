@@ -47,9 +47,7 @@ def spans(drive: Drive, *names: str) -> list[tuple[int, int]]:
 @pytest.mark.parametrize(
     ("table", "most", "apart"), [(HOLDING, 125, 1), (INPUT, 125, 1), (COIL, 2000, 8), (DISCRETE, 2000, 8)]
 )
-def test_adjacent_registers_are_read_up_to_the_modbus_limit_by_default(
-    table: Table, most: int, apart: int
-) -> None:
+def test_adjacent_registers_are_read_up_to_the_modbus_limit(table: Table, most: int, apart: int) -> None:
     drive = family(**{f"r{at}": reading(at, table=table) for at in range(most + 1)})(1)
     asked = [f"r{at}" for at in (*range(0, most, apart), most - 1)]
     assert [count for _, count in spans(drive, *asked)] == [most]

@@ -179,9 +179,7 @@ def test_a_drive_that_is_being_removed_cannot_be_started_after_its_stop(both: Tw
         assert not runs(both.pumps[2])
 
 
-def test_drives_of_an_opening_line_are_stopped_at_exit(
-    both: TwoLines, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_drives_on_an_opening_line_stop_at_exit(both: TwoLines, monkeypatch: pytest.MonkeyPatch) -> None:
     with Poller(plant(both.hall())) as poller:
         with Blocked() as opening:
             monkeypatch.setattr(Bus, "__init__", opening.blocking(Bus.__init__))

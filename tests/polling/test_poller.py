@@ -600,9 +600,7 @@ def test_a_request_without_reply_when_polling_ends_has_a_row(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("leaves", ["the poll", "the drive"])
-def test_a_slot_that_is_not_over_when_polling_ends_has_no_row(
-    responder: tuple[int, str], leaves: str
-) -> None:
+def test_a_slot_not_over_when_polling_ends_has_no_row(responder: tuple[int, str], leaves: str) -> None:
     """Such a slot does not count as a miss either."""
     master, path = responder
     first = polled(Patient(1, name="pump-1"), [Patient.fault], 60.0)

@@ -39,6 +39,8 @@ from multidrop.errors import BusError
 from multidrop.families import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.sim import EncodedDrive, Faults, MotorDrive, SimulatedDrive, simulated
 
+PathOf = Callable[..., tuple[Bus, PathLine]]
+
 pytestmark = pytest.mark.story
 
 PATHS = [
@@ -141,7 +143,7 @@ def test_late_replies_that_look_alike_are_never_taken_for_each_other(delay: Dela
 
 
 @pytest.fixture
-def path_of(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Bus, PathLine]]:
+def path_of(monkeypatch: pytest.MonkeyPatch) -> PathOf:
     def made(sims: list[SimulatedDrive], delay: Delay) -> tuple[Bus, PathLine]:
         return bus_over(PathWire(sims, Faults()), delay, sims, monkeypatch)
 
@@ -151,7 +153,7 @@ def path_of(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Bus, PathLin
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "slow"), READS)
 def test_reads_over_a_slow_path_return_the_right_values(
-    name: str, slow: tuple[Callable[[float], Delay], float], path_of: Callable[..., tuple[Bus, PathLine]]
+    name: str, slow: tuple[Callable[[float], Delay], float], path_of: PathOf
 ) -> None:
     """A client reads four registers of each of two drives in turn, and retries failed reads."""
     path, seconds = slow
@@ -163,7 +165,7 @@ def test_reads_over_a_slow_path_return_the_right_values(
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "slow"), ASKED)
 def test_raw_reads_over_a_slow_path_return_the_right_values(
-    name: str, slow: tuple[Callable[[float], Delay], float], path_of: Callable[..., tuple[Bus, PathLine]]
+    name: str, slow: tuple[Callable[[float], Delay], float], path_of: PathOf
 ) -> None:
     """Raw reads alternate with reads that have the same function and length and other addresses. No raw read
     is retried.
@@ -204,7 +206,7 @@ WRITTEN = {
 @pytest.mark.parametrize("seconds", usually(0.6, 0.0, 0.3, 4.0))
 @pytest.mark.parametrize("name", WRITTEN)
 def test_the_reported_outcomes_of_writes_over_a_slow_path_are_true(
-    name: str, seconds: float, path_of: Callable[..., tuple[Bus, PathLine]]
+    name: str, seconds: float, path_of: PathOf
 ) -> None:
     sim = simulated(WRITTEN[name])
     check_writes(*path_of([sim], constant(seconds)), sim, name)
@@ -212,7 +214,7 @@ def test_the_reported_outcomes_of_writes_over_a_slow_path_are_true(
 
 @pytest.mark.parametrize("name", WRITTEN)
 def test_a_drive_may_answer_a_write_more_slowly_than_reads(
-    name: str, path_of: Callable[..., tuple[Bus, PathLine]], monkeypatch: pytest.MonkeyPatch
+    name: str, path_of: PathOf, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Only the reply to the write is slow. The bus waits for it, and does not read the value back."""
     drive = WRITTEN[name]
@@ -235,9 +237,7 @@ def test_a_drive_may_answer_a_write_more_slowly_than_reads(
         assert (opened.peer(drive).counters().late, opened.peer(drive).silences) == (0, 0)
 
 
-def test_the_timeout_of_a_delixi_drive_is_never_shorter_than_80_ms(
-    path_of: Callable[..., tuple[Bus, PathLine]],
-) -> None:
+def test_the_timeout_of_a_delixi_drive_is_never_shorter_than_80_ms(path_of: PathOf) -> None:
     for drive in (DelixiModbus(1), DelixiNative(1)):
         opened, _ = path_of([simulated(drive)], constant(0.0))
         with opened:
@@ -248,9 +248,7 @@ def test_the_timeout_of_a_delixi_drive_is_never_shorter_than_80_ms(
 
 @pytest.mark.parametrize("seconds", [0.0, 0.3, 0.6])
 @pytest.mark.parametrize("model", MAKE)
-def test_a_stop_over_a_slow_path_is_confirmed(
-    model: str, seconds: float, path_of: Callable[..., tuple[Bus, PathLine]]
-) -> None:
+def test_a_stop_over_a_slow_path_is_confirmed(model: str, seconds: float, path_of: PathOf) -> None:
     """The stop's first frame is sent immediately. The reads after it wait as long as replies are known to
     take.
     """
@@ -354,9 +352,7 @@ def test_a_late_reply_recognised_by_its_id_delays_no_request() -> None:
 
 
 @pytest.fixture(params=[TrueIds, OwnIds])
-def gateway_path_of(
-    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
-) -> Callable[..., tuple[Bus, PathLine]]:
+def gateway_path_of(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> PathOf:
     def made(sims: Sequence[SimulatedDrive], delay: Delay) -> tuple[Bus, PathLine]:
         return bus_over(request.param(sims, Faults(), port=TCP), delay, sims, monkeypatch)
 
@@ -368,7 +364,7 @@ def gateway_path_of(
 def test_reads_over_a_slow_gateway_return_the_right_values(
     name: str,
     slow: tuple[Callable[[float], Delay], float],
-    gateway_path_of: Callable[..., tuple[Bus, PathLine]],
+    gateway_path_of: PathOf,
 ) -> None:
     path, seconds = slow
     drives = two_of(name)
@@ -378,7 +374,7 @@ def test_reads_over_a_slow_gateway_return_the_right_values(
 @pytest.mark.slow
 @table("seconds", [0.0, 0.6, 4.0])
 def test_the_reported_outcomes_of_writes_over_a_slow_gateway_are_true(
-    seconds: float, gateway_path_of: Callable[..., tuple[Bus, PathLine]]
+    seconds: float, gateway_path_of: PathOf
 ) -> None:
     sim = simulated(InnovertIBD(1, ram=["acceleration_time"]))
     check_writes(*gateway_path_of([sim], constant(seconds)), sim, "acceleration_time")
@@ -387,8 +383,6 @@ def test_the_reported_outcomes_of_writes_over_a_slow_gateway_are_true(
 @pytest.mark.slow
 @table("seconds", [0.0, 0.6])
 @table("model", FAMILIES)
-def test_a_stop_over_a_slow_gateway_is_confirmed(
-    model: str, seconds: float, gateway_path_of: Callable[..., tuple[Bus, PathLine]]
-) -> None:
+def test_a_stop_over_a_slow_gateway_is_confirmed(model: str, seconds: float, gateway_path_of: PathOf) -> None:
     sim = simulated(DelixiModbus(1) if model == "delixi-modbus" else MAKE[model](1))
     check_stop(*gateway_path_of([sim], constant(seconds)), sim, seconds)

@@ -94,9 +94,7 @@ def test_an_event_does_not_end_a_trigger_recording_early(writer: TriggeredWriter
     assert currents(writer.files[0]) == [float(at) for at in range(5, 36)]
 
 
-def test_all_trigger_recordings_are_closed_if_closing_one_fails(
-    writer: TriggeredWriter, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_all_recordings_close_if_one_fails(writer: TriggeredWriter, monkeypatch: pytest.MonkeyPatch) -> None:
     writer.write(batch(0, 20, range(15, 16), key_at=18))
     first, last = (recording.writer for recording in writer._open)
     close_last, close_first, closed = last.close, first.close, list[str]()

@@ -30,6 +30,8 @@ from multidrop.transport import clock, open_port
 from multidrop.transport.line import Line
 from multidrop.transport.network_port import MOST_STALL_MS
 
+MakePort = Callable[[], tuple[str, Callable[[], None]]]
+
 
 def wire(port: str = "pty") -> Wire:
     drive = simulated(Toy(1))
@@ -288,9 +290,7 @@ def test_on_a_flooded_port_a_read_raises_the_error_no_reply() -> None:
 
 
 @pytest.mark.parametrize("make", [vanishing_pty, vanishing_socket])
-def test_a_port_lost_during_a_read_raises_line_error(
-    make: Callable[[], tuple[str, Callable[[], None]]],
-) -> None:
+def test_a_port_lost_during_a_read_raises_line_error(make: MakePort) -> None:
     path, hang_up = make()
     thread = threading.Thread(target=hang_up)
     thread.start()
@@ -309,9 +309,7 @@ def test_a_port_lost_during_a_read_raises_line_error(
 
 
 @pytest.mark.parametrize("make", [vanishing_pty, vanishing_socket])
-def test_a_port_lost_during_a_write_raises_unconfirmed(
-    make: Callable[[], tuple[str, Callable[[], None]]],
-) -> None:
+def test_a_port_lost_during_a_write_raises_unconfirmed(make: MakePort) -> None:
     path, hang_up = make()
     thread = threading.Thread(target=hang_up)
     thread.start()

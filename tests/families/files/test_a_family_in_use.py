@@ -146,9 +146,7 @@ def test_plant_with_two_family_files_works(run: Run, plant: Path, monkeypatch: p
 
 
 @pytest.mark.parametrize(("name", "value"), [("light", "1"), ("ramp", "1"), ("run", "off")])
-def test_unconfirmed_family_file_writes_only_harmless_counts(
-    pump: type[Drive], name: str, value: str
-) -> None:
+def test_unconfirmed_family_writes_only_harmless_counts(pump: type[Drive], name: str, value: str) -> None:
     """Without a stop verb, even the declared harmless raw counts are not sent, because they are untested."""
     wire = Wire([simulated(pump(2))], port=ANY_PORT, unpaced=True)
     with Simulator([wire]) as line, Bus(wire.path) as bus:

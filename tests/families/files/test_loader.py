@@ -268,9 +268,7 @@ DEVICE = HEAD + "[reading]\ndevice = { at = 3 }\nspeed = { at = 4, unit = 'Hz', 
         ),
     ],
 )
-def test_mistakes_in_identify_and_verb_are_reported(
-    tmp_path: Path, section: str, mistakes: list[str]
-) -> None:
+def test_mistakes_in_identify_or_verb_are_reported(tmp_path: Path, section: str, mistakes: list[str]) -> None:
     first, rest = ("", DEVICE + section) if section.startswith("[") else (section + "\n", DEVICE)
     (tmp_path / "t.toml").write_text(first + rest)
     found: tuple[str, ...] = ()

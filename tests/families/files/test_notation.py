@@ -36,7 +36,7 @@ from multidrop.families.files.notation import Counting, sent_as
         (40001, 0, "input", (40001, "input")),
     ],
 )
-def test_address_in_toml_is_converted_to_the_address_on_the_wire(
+def test_toml_addresses_are_converted(
     given: Any, counts_from: int | None, table: str | None, sent: tuple[int, str]
 ) -> None:
     assert Counting(counts_from).address(given, table, "holding") == sent
@@ -55,9 +55,7 @@ def test_address_in_toml_is_converted_to_the_address_on_the_wire(
         ("0016", 0, (16, "holding")),
     ],
 )
-def test_address_in_csv_is_converted_to_the_address_on_the_wire(
-    cell: str, counts_from: int | None, sent: tuple[int, str]
-) -> None:
+def test_csv_addresses_are_converted(cell: str, counts_from: int | None, sent: tuple[int, str]) -> None:
     assert Counting(counts_from).address_in_cell(cell, None, "holding") == sent
 
 
