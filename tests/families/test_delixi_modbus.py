@@ -6,15 +6,7 @@ import pytest
 from scripts import DELIXI_MONITORS, Wire, frame, rows, typed
 from tables import table
 
-from multidrop.drive import (
-    Condition,
-    Direction,
-    Framing,
-    NotVerified,
-    State,
-    Unconfirmed,
-    WriteForbidden,
-)
+from multidrop.drive import Condition, Direction, Framing, NotVerified, State, Unconfirmed, WriteForbidden
 from multidrop.drive.register import HOLDING, Kept
 from multidrop.families.delixi import (
     DelixiBaudrate,

@@ -10,15 +10,7 @@ from simulated_bus import one
 from tables import table
 
 from multidrop.control.eeprom_ledger import Ledger
-from multidrop.drive import (
-    Condition,
-    Direction,
-    Framing,
-    NotVerified,
-    State,
-    Unconfirmed,
-    WriteForbidden,
-)
+from multidrop.drive import Condition, Direction, Framing, NotVerified, State, Unconfirmed, WriteForbidden
 from multidrop.drive.register import Carrier, Kept, setting
 from multidrop.errors import NoReply
 from multidrop.families.delixi import (

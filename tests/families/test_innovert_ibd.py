@@ -8,14 +8,7 @@ from scripts import Wire, frame, rows, typed
 from simulated_bus import one
 from tables import table
 
-from multidrop.drive import (
-    Condition,
-    Direction,
-    DriveException,
-    Framing,
-    Unconfirmed,
-    WriteForbidden,
-)
+from multidrop.drive import Condition, Direction, DriveException, Framing, Unconfirmed, WriteForbidden
 from multidrop.drive.register import HOLDING
 from multidrop.families.innovert_ibd import (
     FrequencySource,

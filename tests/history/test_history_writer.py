@@ -130,10 +130,7 @@ def test_a_changed_plant_starts_a_new_segment(tmp_path: Path, writers: Writers) 
 
 
 def test_a_full_disk_is_reported_and_recording_continues(
-    tmp_path: Path,
-    writers: Writers,
-    caplog: pytest.LogCaptureFixture,
-    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path, writers: Writers, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now = [10**12]
     monkeypatch.setattr(clock, "now_ns", lambda: now[0])
@@ -266,10 +263,7 @@ def test_the_oldest_files_beyond_the_size_are_removed(
 
 @pytest.mark.long
 def test_a_failed_compaction_is_reported_and_started_again(
-    tmp_path: Path,
-    writers: Writers,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
+    tmp_path: Path, writers: Writers, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     pytest.importorskip("duckdb", reason="needs duckdb")
     monkeypatch.setattr(writer_module.Compactor, "PAUSE_S", 0.0)

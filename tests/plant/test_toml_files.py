@@ -37,11 +37,7 @@ def mistake(data: str | bytes) -> tuple[int, str]:
         ("name = 'it's'", 1, "s' does not belong here; write each key in its own line"),
         # values
         ("name =\nport = 1", 1, "name has no value; write one after the ="),
-        (
-            "address = 5h",
-            1,
-            '5h has no quotes; write address = "5h"',
-        ),
+        ("address = 5h", 1, '5h has no quotes; write address = "5h"'),
         (
             "baudrate = 9600 bps",
             1,

@@ -362,9 +362,7 @@ def gateway_path_of(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPa
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "slow"), ON_TCP_PATHS)
 def test_reads_over_a_slow_gateway_return_the_right_values(
-    name: str,
-    slow: tuple[Callable[[float], Delay], float],
-    gateway_path_of: PathOf,
+    name: str, slow: tuple[Callable[[float], Delay], float], gateway_path_of: PathOf
 ) -> None:
     path, seconds = slow
     drives = two_of(name)

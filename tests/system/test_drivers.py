@@ -217,10 +217,7 @@ def test_no_family_reads_a_wrong_value_from_a_stalled_adapter(guest: Guest, kind
 
 
 START, STOP = "01050000ff00", "01050001ff00"  # start of the frames that set these coils of drive 1
-SIGNALS = [
-    *((kind, signal.SIGINT) for kind in KINDS),
-    *((kind, signal.SIGTERM) for kind in ("ftdi", "acm")),
-]
+SIGNALS = [*((kind, signal.SIGINT) for kind in KINDS), *((kind, signal.SIGTERM) for kind in ("ftdi", "acm"))]
 
 
 @pytest.mark.slow

@@ -535,9 +535,7 @@ EXTENDING = {
             "[[identify]]: YD1000 has its own identity check",
         ),
     ],
-    "delixi-modbus": [
-        ("[setting]\nsource = { at = 0 }", "(Modbus) has run_source at this address"),
-    ],
+    "delixi-modbus": [("[setting]\nsource = { at = 0 }", "(Modbus) has run_source at this address")],
 }
 
 

@@ -54,37 +54,13 @@ WRONG: list[tuple[type[Drive], dict[str, Any], str]] = [
     (Acs355, {"status": reading(3, number_format=NumberFormat.U32)}, "status: it is one word"),
     (Acs355, {"status": reading(3, number_format=NumberFormat.I16)}, "status: it is one word of bits"),
     (Acs355, {"control": command(0, table=COIL)}, "control: "),
-    (
-        Acs355,
-        {"reference": setting(1, "%", step=-0.005)},
-        "reference: a greater count must mean more",
-    ),
+    (Acs355, {"reference": setting(1, "%", step=-0.005)}, "reference: a greater count must mean more"),
     (Atv320, {"sleeve": command(9, harmless=(1,))}, "sleeve: only control has harmless counts"),
-    (
-        Atv320,
-        {"output_frequency": reading(9, "Hz", part=(0, 3))},
-        "output_frequency: it is 0 only at rest",
-    ),
-    (
-        Atv320,
-        {"output_frequency": reading(9, "Hz", offset=-50)},
-        "output_frequency: it is 0 only at rest",
-    ),
-    (
-        VfdEl,
-        {"reference_in_force": reading(9, "%", step=0.01)},
-        "reference_in_force: its unit is not",
-    ),
-    (
-        Atv320,
-        {"control": command(1, IntFlag("Bits", {"reverse": 8}))},
-        "control: bit 3 is ENABLE_OPERATION",
-    ),
-    (
-        Atv320,
-        {"control": command(1, IntFlag("Bits", {"jog": 256}))},
-        "control: bits may only add reverse",
-    ),
+    (Atv320, {"output_frequency": reading(9, "Hz", part=(0, 3))}, "output_frequency: it is 0 only at rest"),
+    (Atv320, {"output_frequency": reading(9, "Hz", offset=-50)}, "output_frequency: it is 0 only at rest"),
+    (VfdEl, {"reference_in_force": reading(9, "%", step=0.01)}, "reference_in_force: its unit is not"),
+    (Atv320, {"control": command(1, IntFlag("Bits", {"reverse": 8}))}, "control: bit 3 is ENABLE_OPERATION"),
+    (Atv320, {"control": command(1, IntFlag("Bits", {"jog": 256}))}, "control: bits may only add reverse"),
 ]
 
 

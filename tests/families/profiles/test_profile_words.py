@@ -14,15 +14,7 @@ from scripts import Wire
 from tables import table
 
 from multidrop import Bus, load_family
-from multidrop.drive import (
-    Condition,
-    Direction,
-    NotVerified,
-    State,
-    Unconfirmed,
-    Unsupported,
-    WriteForbidden,
-)
+from multidrop.drive import Condition, Direction, NotVerified, State, Unconfirmed, Unsupported, WriteForbidden
 from multidrop.drive.declaration_check import DeclarationError
 from multidrop.drive.register import Register, command
 from multidrop.sim import SimulatedDrive, Simulator, simulated
