@@ -176,9 +176,7 @@ def test_frames_split_over_packets_and_several_in_one_packet_are_read(tmp_path: 
 
 
 def test_a_reply_in_pieces_with_pauses_is_one_frame(tmp_path: Path) -> None:
-    """An adapter delivers a reply of 165 bytes in pieces of 32, as in the report
-    alerighi/modbus-sniffer#9.
-    """
+    """A reply of 165 bytes comes in pieces of 32, as in alerighi/modbus-sniffer#9."""
     reply = checksums.rtu("0B 03 A0" + bytes((at * 7 + 3) % 256 for at in range(160)).hex())
     pieces = [checksums.rtu("0B 03 08 36 00 50"), *(reply[at : at + 32] for at in range(0, len(reply), 32))]
     path = tmp_path / "a.pcap"
@@ -327,10 +325,7 @@ def test_unit_id_0_of_modbus_tcp_is_not_a_broadcast() -> None:
 
 @pytest.fixture
 def captured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Captured:
-    """Return a plant file, the capture of its poll with one silent drive, and the poll's rows.
-
-    The drive that answers has a long timeout, so that no reply comes too late on a busy machine.
-    """
+    """Return a plant file, the capture of its poll with one silent drive, and the poll's rows."""
     monkeypatch.setattr(InnovertIBD, "response_timeout", PATIENCE)
     monkeypatch.setattr(InnovertIBD, "answering_time", PATIENCE)
     plant, path = tmp_path / "plant.toml", tmp_path / "a.pcapng"
@@ -427,9 +422,7 @@ def block(kind: int, body: bytes) -> bytes:
 
 
 def packet(interface: int, content: bytes, stated: int | None = None) -> bytes:
-    """Return an enhanced packet block. Its header states the length `stated`, or by default the true
-    length.
-    """
+    """Return an enhanced packet block, whose header states its true length or `stated`."""
     length = len(content) if stated is None else stated
     return block(6, struct.pack("<5I", interface, 0, 0, length, length) + content + bytes(-len(content) % 4))
 
@@ -500,9 +493,7 @@ def test_a_capture_cut_within_an_interface_block_is_read_up_to_that_block(tmp_pa
 
 @table("tags", [b"\0\x0c\0\x05mb", b"\0\x0c\0\x05mbrtu", b"\0\x0c\xff\xff", b"\0\0\0\0", b"\0"])
 def test_a_packet_that_ends_within_its_tags_is_empty(tmp_path: Path, tags: bytes) -> None:
-    """A packet of the link type "exported PDU" starts with tags that describe its frame. This packet ends
-    within its tags, or directly after them.
-    """
+    """A packet of the link type "exported PDU" starts with tags that describe its frame."""
     path = tmp_path / "a.pcapng"
     interface = block(1, struct.pack("<HHI", 252, 0, 0))
     path.write_bytes(SECTION + interface + packet(0, tags) + packet(0, b"\0\0\0\0" + READ))
@@ -569,9 +560,7 @@ OTHER_BLOCK = struct.pack("<II", 5, 1024) + bytes(1012) + struct.pack("<I", 1024
 
 @pytest.mark.slow
 def test_a_capture_truncated_during_reading_raises_a_one_sentence_error(tmp_path: Path) -> None:
-    """A separate process reads the file. If it mapped the file, reading past the end would kill that
-    process.
-    """
+    """A process that mapped the file would be killed by reading past its end."""
     path = write(tmp_path / "it.pcapng", RTU * 20)
     code = (
         "import os, sys\nfrom multidrop.capture import Capture, CaptureError\n"

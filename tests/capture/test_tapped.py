@@ -85,9 +85,7 @@ def echoing_wires() -> list[Wire]:
 def captured(
     capture: Path, make: Callable[[], list[Wire]], drives: list[PolledDrive], enough: Counter[str]
 ) -> tuple[list[Row], list[Row]]:
-    """Poll until each status has as many rows as in `enough`. Return the polled rows, and the rows decoded
-    from the capture.
-    """
+    """Poll until `enough` rows of each status; return the polled and the decoded rows."""
     with served(make) as (path,):
         known = plant(line(path, *drives, name="hall-1"))
         poller = Poller(known)
@@ -108,9 +106,7 @@ def captured(
 
 
 def by_exchange(rows: list[Row]) -> dict[int, list[tuple[object, ...]]]:
-    """Return the rows by the time of their request, without rows whose request was not sent. Rows have no
-    monotonic time.
-    """
+    """Return the sent requests' rows by the time of their request, without monotonic times."""
     found: dict[int, list[tuple[object, ...]]] = {}
     for row in rows:
         if row.status not in NEVER_ON_THE_LINE:
@@ -123,16 +119,12 @@ IN_DOUBT_NS = 100_000_000  # longer than any timeout: a reply as late as this ma
 
 
 def by_time(rows: list[Row]) -> dict[int, list[tuple[object, ...]]]:
-    """Return `by_exchange` of the rows, without rows whose reply was so late that it may belong to an earlier
-    request.
-    """
+    """Return `by_exchange` without rows whose reply may belong to an earlier request."""
     return by_exchange([row for row in rows if (row.uncertainty_ns or 0) < IN_DOUBT_NS])
 
 
 def check(rows: list[Row], decoded: list[Row]) -> None:
-    """Check that the capture has all exchanges of the poll, except the last one, which may be incomplete.
-    Repeated requests, and requests that test for an echo or a late reply, are only in the capture.
-    """
+    """Check that the capture has all exchanges of the poll, except perhaps the last one."""
     recorded = list(by_time(rows).items())
     read = by_exchange(decoded)
     assert [time for time, _ in recorded[:-1] if time not in read] == []
@@ -260,9 +252,7 @@ def test_bytes_lost_from_a_full_capture_buffer_are_counted() -> None:
 
 
 def test_a_capture_has_the_noise_around_a_reply() -> None:
-    """The noise before the reply is longer than the line's buffer. More noise comes together with the
-    reply.
-    """
+    """The noise before the reply is longer than the line's buffer."""
     driver, tap = LineDriver(), Tap()
     driver.begin(asking())
     driver._line.tap = tap.c
@@ -418,9 +408,7 @@ class Watched:
         return self.port
 
     def told(self, reply: bytes) -> list[str]:
-        """Carry out an exchange with this reply; return its anomalies. It starts 1 s after the previous
-        exchange, when a late reply can no longer come.
-        """
+        """Carry out an exchange with this reply, when no late reply can come; return its anomalies."""
         self.line.now += 1000 * MS
         self.line.begin(self._exchange)
         self.line.wait_until_write()

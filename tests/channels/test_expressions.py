@@ -42,10 +42,7 @@ PUMPS = [
 
 
 def value_of(text: str, unit: str = "") -> float | None:
-    """Return the value, in this unit, of an expression of the drive pump-1.
-
-    The drive pump-2 has a power of 700 W.
-    """
+    """Return the value of an expression of pump-1 in this unit. The power of pump-2 is 700 W."""
     series = SeriesTable(PUMPS)
     values: list[float | None] = [
         NOW.get(name) if drive == "pump-1" else 700.0 for drive, name in series.slots

@@ -454,10 +454,7 @@ def read_until_closed(bus: Bus, rig: Rig) -> None:
 @pytest.mark.slow
 @patient
 def test_reads_on_a_bus_that_another_thread_closes_end_with_an_error() -> None:
-    """Each call after the bus was closed raises an error.
-
-    Each round has a new line: on the old line, a new bus would wait for late replies to the closed bus.
-    """
+    """Each round has a new line, because the old line may still get late replies."""
     for _ in range(20):
         with unpaced(simulated(Rig(1))) as sim:
             bus = Bus(path(sim))

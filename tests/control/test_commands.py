@@ -378,10 +378,7 @@ class TimedStops:
         return [ended]
 
     async def called_beside(self, seconds: float) -> CommandResult:
-        """Return the result of a stop that is called during a repeated stop.
-
-        The repeated stop gives up after `seconds`.
-        """
+        """Return the result of a stop called while a repeated stop gives up after `seconds`."""
         repeated = asyncio.get_running_loop().create_future()
         self.stops.note([self._drive], repeated)
         called = self.stops.send_once(self._drive)

@@ -36,10 +36,7 @@ def counts(frame: FrameType) -> bool:
 
 
 def interrupted(call: Callable[[], object], nth: int) -> KeyboardInterrupt | None:
-    """Call a function and interrupt it before the nth line of its exchanges; return the interruption.
-
-    Return None if the exchanges have fewer lines.
-    """
+    """Interrupt a call before the nth line of its exchanges; return None if they have fewer lines."""
     try:
         with interrupted_at(nth, counts):
             call()

@@ -275,10 +275,7 @@ def test_the_motor_of_a_drive_attached_after_leave_cannot_be_started() -> None:
 
 
 def test_a_detached_drive_is_freed_at_once() -> None:
-    """It is freed without a garbage collection, so memory does not grow if drives change for years.
-
-    `knows_identity` accepts a detached drive, because a drive may be detached just before the call.
-    """
+    """Memory does not grow if drives change for years, even without a garbage collection."""
     line, drive, _ = one(InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(20)
     drive.stop()

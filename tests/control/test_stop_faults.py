@@ -67,10 +67,7 @@ def is_ours(frame: FrameType) -> bool:
 
 
 def check_failing(nth: int, failure: type[BaseException], all_of_them: bool) -> bool:
-    """Raise `failure` at the nth opcode of a stop; check that motors stop and that no state is left behind.
-
-    Return False if the stop has fewer opcodes.
-    """
+    """Return False if a stop has fewer than n opcodes; else check a stop that fails at the nth opcode."""
     line, drives, sims = che_drives(2 if all_of_them else 1, runs_s=10)
     begun_before = [drive.begin_call("start", drive.stops_called[0]) for drive in drives]
     stop, told, place = line.bus.stop_all if all_of_them else drives[0].stop, "", []
@@ -394,9 +391,7 @@ def running_family(family: str) -> tuple[SimulatedBus, Drive, MotorDrive]:
 
 
 def check_stops(family: str, failure: str, step: int) -> None:
-    """Raise this failure at one line of the stop after another, `step` lines apart; check each time that the
-    motor stops.
-    """
+    """Check that the motor stops although the stop fails at one of its lines, each `step` lines apart."""
     for nth in count(1, step):
         line, drive, sim = running_family(family)
         told = ""

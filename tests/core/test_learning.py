@@ -126,10 +126,7 @@ def given_up(line: LineDriver, drive: Peer, request: Message = READ) -> int:
 
 
 def time_out(line: LineDriver, drive: Peer, request: Message = READ) -> int:
-    """Return the timeout: the result of `given_up` minus the duration of the 7 characters of a reply.
-
-    The line also waits for these characters, because some adapters deliver only whole replies.
-    """
+    """Return the timeout, without the time of the reply's 7 characters."""
     return given_up(line, drive, request) - 7 * CHARACTER
 
 

@@ -134,10 +134,7 @@ def test_documentation_lists_the_stops_that_are_withheld(declared: str, there: s
 
 @pytest.mark.parametrize("declared", ["delta-vfd-el", "delta-cp2000"])
 def test_parameter_with_the_value_of_the_address_does_not_hide_a_goodrive(declared: str) -> None:
-    """Register 0900H of a Goodrive is P09.00, the source of the PID reference.
-
-    Its value may equal the address.
-    """
+    """Register 0900H of a Goodrive is P09.00, whose value may equal the address."""
     pair = Pair(declared, "invt-goodrive", turns=False)
     show = pair.sim.answer
     pair.sim.answer = lambda request, now: (

@@ -633,10 +633,7 @@ def test_yd1000_start_after_an_emergency_stop_advises_reset_fault() -> None:
 
 
 def test_yd1000_start_after_an_emergency_stop_at_rest_advises_reset_fault() -> None:
-    """No register is frozen in this case.
-
-    Only an object that had read the fault record could see a new entry.
-    """
+    """No register is frozen in this case, so a new drive object cannot see the trip."""
     _, drive, _ = one(YD1000(1))
     drive.emergency_stop()
     drive.set_frequency(30)

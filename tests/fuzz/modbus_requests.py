@@ -47,9 +47,7 @@ def read_requests(path: Path) -> None:
 
 
 def taken(stream: bytes, size: int) -> list[MbapRequest]:
-    """Return the requests that the server finds in a stream in pieces of `size` bytes, up to the first
-    invalid bytes.
-    """
+    """Return the requests that the server finds in pieces of `size` bytes, until invalid bytes."""
     buffer, found = bytearray(), []
     for at in range(0, len(stream), size):
         buffer += stream[at : at + size]

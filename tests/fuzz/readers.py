@@ -163,9 +163,7 @@ def read_samples(path: Path) -> None:
 
 
 def _pair(capture: Capture) -> None:
-    """Pair the requests and replies of a capture. Check the counts of exchanges and frames, and that every
-    byte of junk is counted.
-    """
+    """Pair requests and replies of a capture; check that every exchange, frame and byte is counted."""
     pairings: list[Pairing] = []
     splitters: list[Splitter] = []
     junk = exchanges = 0

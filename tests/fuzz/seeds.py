@@ -173,9 +173,7 @@ def captures() -> Iterator[bytes]:
 
 
 def requests() -> Iterator[bytes]:
-    """Yield streams of Modbus TCP clients: reads, writes, stops, unknown functions, a broadcast, and other
-    bytes.
-    """
+    """Yield byte streams of Modbus TCP clients: reads, writes, stops, a broadcast and invalid bytes."""
     bodies = [
         *("01 03 30 00 00 02", "01 04 F0 00 00 0B", "02 01 00 00 00 04", "02 02 00 00 00 01"),
         *("01 06 20 00 13 88", "01 06 10 00 00 05", "01 06 F0 0A 00 01", "02 05 00 01 FF 00"),

@@ -32,9 +32,7 @@ COMPACTED = pytest.mark.parametrize("compacted", usually(2, 0, 4), ids="{} compa
 
 @pytest.fixture(scope="module")
 def rows() -> list[list[Row]]:
-    """Return rows of four segments: the second follows the first, the third follows a gap, and the clock was
-    set back before the fourth.
-    """
+    """Return rows of four segments, with a gap before the third and a clock set back before the fourth."""
     begins = (NOON, NOON + 80 * SECOND, NOON + 300 * SECOND, NOON + 60 * SECOND)
     made = [random_rows(seed, begin, 400) for seed, begin in enumerate(begins)]
     return [
@@ -224,9 +222,7 @@ def test_a_reader_sees_new_rows_exactly_once(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_reader_loses_no_row_when_files_are_compacted_meanwhile(tmp_path: Path) -> None:
-    """Files are compacted after the reader has listed them and before it reads them. Each row is still read
-    once.
-    """
+    """Files are compacted after they were listed and before they are read."""
     pytest.importorskip("duckdb", reason="needs duckdb")
     rows = [random_rows(number, NOON + number * 60 * SECOND, 200) for number in range(4)]
     record(tmp_path, rows)
@@ -328,9 +324,7 @@ def test_export_without_duckdb_uses_pyarrow(tmp_path: Path, monkeypatch: pytest.
 @pytest.mark.slow
 @pytest.mark.parametrize("most", [0, 150, 100_000], ids="{} rows are kept".format)
 def test_buckets_include_all_new_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int) -> None:
-    """Queries for changing series and ranges use cached rows. Some ranges start before the cached rows,
-    others long after them.
-    """
+    """Some ranges start before the cached rows, others long after them."""
     monkeypatch.setattr(growing, "MOST_KEPT", most)
     monkeypatch.setattr(growing, "MOST_TENS", 3 if most else 0)
     dice = random.Random(most)

@@ -335,11 +335,7 @@ def killed_recorder(folder: Path, run: int, dice: random.Random) -> int:
 
 
 def check_runs(history: History, written: dict[str, int], begin: int | None = None) -> int:
-    """Check that the history has at least the written rows of each run, without gaps. Return its number of
-    rows.
-
-    Rows before `begin` are ignored.
-    """
+    """Return the number of rows from `begin` on; check that each run's rows have no gap."""
     runs: dict[str, list[int]] = defaultdict(list)
     for rows in history.read(None, begin):
         for row in rows:
@@ -402,9 +398,7 @@ def inside(folder: Path) -> SimpleNamespace:
 
 @asynccontextmanager
 async def historian_in(folder: Path) -> AsyncIterator[historian.Historian]:
-    """Yield a Historian (the gateway's recorder) that records into this folder. It is closed after the
-    block.
-    """
+    """Yield the gateway's recorder of this folder; it is closed after the block."""
     made = build(HistorySettings(), inside(folder))
     try:
         yield made
@@ -458,9 +452,7 @@ async def test_large_history_queries_run_outside_the_event_loop_or_are_refused(
 
 @pytest.mark.parametrize("kind", ["csv", "parquet"])
 async def test_exports_of_a_history_start_outside_the_event_loop(tmp_path: Path, kind: str) -> None:
-    """An export first reads the metadata of up to thousands of files, which would block the loop for
-    seconds.
-    """
+    """An export first reads the metadata of up to thousands of files."""
     readers: list[int] = []
 
     class Noted(History):

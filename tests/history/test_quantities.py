@@ -25,17 +25,13 @@ STATES, OTHER_STATES = {"values": {"RUN": 1, "STOP": 2}}, {"values": {"STOP": 1,
 
 
 def described(about: dict[str, Any]) -> dict[str, Any]:
-    """Return the metadata of a plant with two pumps. `about` describes the register `load` of pump-1; the
-    `load` of pump-2 is in amperes.
-    """
+    """Return metadata of two pumps. `about` describes the `load` of pump-1; that of pump-2 is in A."""
     drives = {"pump-1": {"registers": {"load": about}}, "pump-2": {"registers": {"load": AMPERE}}}
     return {"drives": drives}
 
 
 def recorded(folder: Path, *segments: dict[str, Any]) -> None:
-    """Record a segment for each description of the register. Each segment has its own value, in the first 30
-    s of its own minute.
-    """
+    """Record one segment for each description of the register, each with its own value."""
     with SegmentWriter(folder / "rows.arrows", {}, every=1e9) as writer:
         for number, about in enumerate(segments):
             writer.rotate(described(about))
@@ -57,9 +53,7 @@ def how(request: pytest.FixtureRequest) -> str:
 
 
 def kept(folder: Path, how: str, count: int) -> None:
-    """Prepare the history as `how` says: "segments" leaves the recorded segments, "files" compacts them,
-    "days" also merges each day's summaries.
-    """
+    """Keep the history as "segments", compacted "files", or "days" with merged summaries."""
     if how == "segments":
         return
     pytest.importorskip("duckdb", reason="needs duckdb")
@@ -159,9 +153,7 @@ PARTED = {SERIES: {10.0, 1000.0}, f"{SERIES} [A]": {1.0, 100.0}, OTHER: {1.0, 10
 
 @pytest.mark.long
 def test_rows_with_an_earlier_unit_have_a_separate_column(tmp_path: Path, how: str) -> None:
-    """Rows with an earlier unit are in a column with that unit in its name, in queries and in every
-    export.
-    """
+    """The column's name has the unit, in queries and in every export."""
     (tmp_path / "h").mkdir()
     recorded(tmp_path / "h", AMPERE, PERCENT, AMPERE, PERCENT)
     kept(tmp_path / "h", how, 4)

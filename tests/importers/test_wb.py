@@ -251,10 +251,7 @@ def test_import_error_names_the_file(tmp_path: Path) -> None:
 
 
 def test_translations_of_wb_mqtt_serial_names_become_titles(tmp_path: Path) -> None:
-    """A parameter's `title` is translated.
-
-    For a channel of a subdevice, the translated names of both are joined.
-    """
+    """For a channel of a subdevice, the translated names of both are joined."""
     words = {"Voltage": "Напряжение", "First": "Первый", "mode_title": "Режим", "Energy": ""}
     document = with_subdevice({"name": "First", "device_type": "ch"}, {**VOLTAGE, "address": 1})
     document["device"]["parameters"] = {"mode": {"title": "mode_title", "address": 2}}

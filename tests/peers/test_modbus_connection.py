@@ -76,9 +76,7 @@ async def device(answer: Answer, framer: str, late: Iterator[bool]) -> AsyncIter
 
 
 class Registers:
-    """A simulated device whose registers can be read and written. `requests` has the bodies of all requests
-    so far.
-    """
+    """A simulated device. `requests` has the bodies of all requests so far."""
 
     def __init__(self, held: Callable[[int], int]) -> None:
         self.held = held

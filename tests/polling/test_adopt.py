@@ -78,9 +78,7 @@ def statuses(rows: Sequence[Row], drive: str) -> set[str]:
 
 
 def check_rates(made: ClockedLines, wait: float = 1.0, **periods: float) -> list[Row]:
-    """Wait for `wait` s, then check for 5 s that each drive is polled with its period in s; return the rows.
-    `periods` has the drives' names, with an underscore in place of the hyphen.
-    """
+    """Wait for `wait` s, then poll for 5 s; return the rows and check each drive's period in s."""
     if wait:
         made.run(wait)
     rows = made.run(5)
@@ -268,9 +266,7 @@ def test_a_plant_can_be_adopted_before_polling_starts() -> None:
 
 
 def calls_to_add_one_to(count: int) -> int:
-    """Return how many functions of the module `adoption` are called when one line is added to `count`
-    lines.
-    """
+    """Return how many functions of `adoption` are called when one line is added to `count` lines."""
     lines = [hall(toy(f"pump-{number}", 1), name=f"hall-{number}") for number in range(count)]
     calls = 0
 

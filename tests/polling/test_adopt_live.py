@@ -281,9 +281,7 @@ def test_a_drive_can_be_removed_during_another_stop(both: TwoLines, monkeypatch:
 
 
 def test_replaced_drives_stay_attached_during_stops(both: TwoLines, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The new drives have the names of the old ones. Until all stops have ended, the old drives can still be
-    stopped.
-    """
+    """The new drives have the names of the old ones, which can still be stopped."""
     replacements = [polled(Quick(address, name=f"pump-{address}", silence=0.01), []) for address in (1, 2)]
     with Poller(plant(both.hall())) as poller:
         bus = poller.bus("hall")
@@ -420,9 +418,7 @@ def test_closing_a_poller_waits_for_adopt(both: TwoLines, monkeypatch: pytest.Mo
 
 
 def test_adopt_connects_to_several_servers_in_parallel(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two calls of `create_connection` wait for each other, so connecting one after the other would fail.
-    Closing the connections never sleeps.
-    """
+    """Two calls of `create_connection` wait for each other. Closing never sleeps."""
     with TwoLines("socket://127.0.0.1:0") as both:
         lines = both.hall(), both.yard()
         all_asked = threading.Barrier(2)

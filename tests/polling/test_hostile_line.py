@@ -122,9 +122,7 @@ def test_a_delixi_reply_equal_to_its_request_is_not_taken_for_an_echo(register: 
 
 @pytest.mark.story
 def test_an_echo_of_a_silent_delixi_drive_is_not_read_as_0_for_long() -> None:
-    """A broken wire may silence a drive and echo requests. An echo is read as the value 0; after two of them,
-    a probe detects the echo.
-    """
+    """A broken wire may silence a drive and echo requests. After two echoes, a request detects it."""
     drive = DelixiNative(1, name="drive-1")
     asked = polled(drive, [DelixiNative.output_frequency, DelixiNative.output_current])
     wire = ClockedWire([simulated(drive)], Faults())
@@ -151,9 +149,7 @@ def test_polling_without_rates_recovers_from_a_fault(kind: str) -> None:
 
 
 def all_lines() -> Iterator[list[Drive]]:
-    """Yield the drives of each line: first one line for each family variant, then one line with all
-    variants.
-    """
+    """Yield the drives of one line for each family variant, then of one line with all variants."""
     yield from map(of_one_variant, LINES.values())
     yield of_all_variants()
 

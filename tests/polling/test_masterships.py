@@ -192,9 +192,7 @@ def test_a_new_master_listens_before_its_first_poll(mastership: Mastership, ever
 @pytest.mark.slow
 @pytest.mark.parametrize("port", ["pty", "tcp://127.0.0.1:0"])
 def test_nothing_is_sent_during_the_guard_time_of_the_previous_master(port: str) -> None:
-    """The guard time is longer here than the time for which a serial line is listened to before the first
-    request.
-    """
+    """Here the guard time is longer than the time for which a new master listens."""
     mastership = Mastership(guard_s=1.0)
     try:
         hold(mastership)
@@ -438,9 +436,7 @@ class Busy:
 def test_closing_a_poller_waits_for_a_request_until_the_mastership_ends(
     monkeypatch: pytest.MonkeyPatch, left_ns: int, waited_ns: int
 ) -> None:
-    """The mastership ends `left_ns` after the start, and soon afterwards the kernel kills the process. With
-    `left_ns` 0 the process holds no mastership, so no timer runs.
-    """
+    """The mastership ends after `left_ns`; with 0 the process holds no mastership."""
     now = [1000 * S]
     until_ns = now[0] + left_ns if left_ns else 0
     monkeypatch.setattr(clock, "now_ns", lambda: now[0])

@@ -96,9 +96,7 @@ class Polling:
         until(lambda: self.statuses(drive)[status] >= before + count)
 
     def check(self, *statuses: str) -> None:
-        """Check that the summary's counts of each line and drive equal those of the rows. If `statuses` are
-        given, rows may have only these statuses, and those that a busy computer causes.
-        """
+        """Check that the summary equals the rows, whose statuses may only be `statuses` and late ones."""
         assert not statuses or self.statuses().keys() <= {*statuses, *HOST_LATE}
         summary = self.poller.summary()
         misses = Counter(row.status for row in self.rows if row.value is None)

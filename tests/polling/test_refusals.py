@@ -210,9 +210,7 @@ def test_a_block_that_was_answered_before_is_not_split_if_the_drive_falls_silent
 @example({2, 4}, 5, 1)
 @given(st.sets(st.integers(1, 5), max_size=3), st.integers(1, 6), st.integers(1, 6))
 def test_every_register_that_can_be_read_alone_is_polled(refused: set[int], most: int, silent: int) -> None:
-    """Register 0 is never refused, because its reply proves that no late reply is due. Without that proof,
-    each missing reply would delay the next request by two minutes.
-    """
+    """Register 0 is never refused: its reply shows that no late reply is due."""
     drive = family(6)(1, name="pump-1")
     sim = Picky(drive, refused, most, silent)
     with clocked_line_of(drive, sim, every=5.0) as clocked:

@@ -197,9 +197,7 @@ class Scattered(Drive):
 def test_every_register_is_read_although_the_server_closes_connections_early(
     every: float | None, most: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An interrupted request is the first one on the next connection, unless it was also the first on the old
-    one.
-    """
+    """An interrupted request is usually repeated first on the next connection."""
     monkeypatch.setattr(poller_module, "LOOK_NS", 5_000_000)  # so that each lost port is noticed soon
     seen = Counter[tuple[str, float | None]]()
     with server(lambda nth, address: nth == most) as port:

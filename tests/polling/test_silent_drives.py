@@ -136,9 +136,7 @@ SOON, LATE = 0.005, 0.06  # short and long response delay in s
 
 
 class Wide(Toy):
-    """A drive with two registers far apart. One request for both is faster only if the response delay is
-    long.
-    """
+    """A drive with two registers far apart. One request for both pays only if replies are slow."""
 
     most_registers = {HOLDING: 100}
     readable_gaps = {HOLDING: range(100)}

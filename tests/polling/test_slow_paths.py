@@ -167,9 +167,7 @@ def test_reads_over_a_slow_path_return_the_right_values(
 def test_raw_reads_over_a_slow_path_return_the_right_values(
     name: str, slow: tuple[Callable[[float], Delay], float], path_of: PathOf
 ) -> None:
-    """Raw reads alternate with reads that have the same function and length and other addresses. No raw read
-    is retried.
-    """
+    """Raw reads alternate with similar reads of other addresses. No raw read is retried."""
     path, seconds = slow
     drives = [drive for drive in of_one_variant(LINES[name]) if drive.framing is not Framing.DELIXI]
     opened, line = path_of([EncodedDrive(drive) for drive in drives], path(seconds))
@@ -249,9 +247,7 @@ def test_the_timeout_of_a_delixi_drive_is_never_shorter_than_80_ms(path_of: Path
 @pytest.mark.parametrize("seconds", [0.0, 0.3, 0.6])
 @pytest.mark.parametrize("model", MAKE)
 def test_a_stop_over_a_slow_path_is_confirmed(model: str, seconds: float, path_of: PathOf) -> None:
-    """The stop's first frame is sent immediately. The reads after it wait as long as replies are known to
-    take.
-    """
+    """The stop's first frame is sent immediately. The reads after it wait for slow replies."""
     sim = simulated(MAKE[model](1))
     assert check_stop(*path_of([sim], constant(seconds)), sim, seconds) <= 6
 

@@ -36,9 +36,7 @@ COMMENT = Row(UTC_0 + SECOND // 2, SECOND // 2, None, "event", "comment", None, 
 
 
 def rows(number: int) -> list[Row]:
-    """Return rows of two drives and of a test's phases, at irregular times; a tenth of the rows has no
-    value.
-    """
+    """Return rows at irregular times of two drives and a test; a tenth has no value."""
     chance, found, at = random.Random(number), [*phase_row(0, UTC_0, 0), COMMENT], 0.0
     for _ in range(number):
         at += chance.uniform(0.0005, 0.003)
@@ -290,9 +288,7 @@ def test_two_interrupts_during_a_step_of_an_mdf4_export_leave_no_file(
 def test_interrupt_between_two_steps_of_an_export_leaves_no_file(
     suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Ctrl-C comes when the main thread passes a step to the library's thread. The test repeats this for each
-    step.
-    """
+    """Ctrl-C comes when the main thread passes a step to the library's thread."""
     source, submit = record(tmp_path / "run.arrows", rows(400), METADATA), ThreadPoolExecutor.submit
     monkeypatch.setattr("multidrop.recording.series.PIECE_ROWS", 100)
     for last in count():
@@ -318,9 +314,7 @@ def test_interrupt_between_two_steps_of_an_export_leaves_no_file(
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no limit for a file's size")
 @pytest.mark.parametrize("suffix", [".mf4", ".h5"])
 def test_full_disk_leaves_no_exported_file(suffix: str, tmp_path: Path) -> None:
-    """The system limits files to 20,000 bytes. HDF5 would crash the process if it noticed the failed
-    write.
-    """
+    """HDF5 would crash the process if it noticed the failed write at 20,000 bytes."""
     import resource
 
     source = record(tmp_path / "run.arrows", rows(2000), METADATA)

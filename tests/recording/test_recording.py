@@ -465,9 +465,7 @@ def test_pandas_and_duckdb_read_arrow_recordings_through_pyarrow(tmp_path: Path)
 
 
 class Grown:
-    """Makes batches like a poller to which drives are added: each batch has one more drive than the previous
-    one.
-    """
+    """Makes batches like a poller to which one drive is added before each batch."""
 
     def __init__(self) -> None:
         self.names = Names(["pump-0"])
@@ -546,9 +544,7 @@ def test_all_exception_codes_are_recorded_in_one_batch(tmp_path: Path) -> None:
 
 
 def test_a_row_in_an_arrows_file_takes_at_most_35_bytes(tmp_path: Path) -> None:
-    """The rows are those of 31 drives with 10 values each, at 10 Hz, in batches of 0.1 s. Some rows have no
-    value.
-    """
+    """The rows are those of 31 drives with 10 values at 10 Hz; some have no value."""
     drives = Names([f"pump-{number}" for number in range(31)])
     registers = Names([f"some_register_{number}" for number in range(10)])
     with open_writer(tmp_path / "a.arrows", METADATA) as writer:

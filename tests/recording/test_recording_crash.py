@@ -45,9 +45,7 @@ SUPPORT = [str(folder) for folder in (Path(__file__).parents[1] / "support").ite
 
 
 def record(path: Path, batches: int) -> list[int]:
-    """Record batches with increasing numbers. Return the file's length without batches, and after each
-    batch.
-    """
+    """Record batches of increasing numbers; return the file's length before and after each batch."""
     lengths = []
     with open_writer(path, METADATA) as writer:
         lengths.append(path.stat().st_size)
@@ -211,9 +209,7 @@ for at in count():
 @pytest.mark.slow
 @pytest.mark.parametrize("suffix", usually(".arrows", ".csv"))
 def test_a_killed_writer_keeps_all_written_batches(tmp_path: Path, suffix: str) -> None:
-    """SIGKILL ends a process that writes at full speed. Every batch for which `write` had returned can be
-    read.
-    """
+    """Every batch for which `write` had returned can be read."""
     for until in (1, examples(160)):
         path = tmp_path / f"{until}{suffix}"
         command = [sys.executable, "-c", RECORD_FOR_EVER, str(path), *SUPPORT]
@@ -449,9 +445,7 @@ def test_a_file_with_other_columns_is_refused_as_a_recording(tmp_path: Path, suf
 def test_parquet_file_that_unpacks_to_gigabytes_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, uses_dictionary: bool
 ) -> None:
-    """A few kilobytes of zstd can expand to gigabytes of names, with or without a dictionary. The limits and
-    the data are both smaller than in practice, by the same factor.
-    """
+    """Limits and data are smaller than in practice by the same factor."""
     monkeypatch.setattr(parquet, "MOST_TEXT", parquet.MOST_TEXT // 1000)
     monkeypatch.setattr(parquet, "MOST_OF_GROUP", parquet.MOST_OF_GROUP // 1000)
     rows, name = (1000, "x" * 3600) if uses_dictionary else (600, "x" * 1000)
@@ -504,9 +498,7 @@ def test_error_for_damaged_csv_metadata_names_the_file(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_damage_anywhere_in_a_recording_raises_a_one_sentence_error(tmp_path: Path, suffix: str) -> None:
-    """Random bytes are overwritten. Then the reader may return wrong values or fewer rows, or raise a
-    one-sentence error, but never crash.
-    """
+    """The reader may also return wrong or fewer rows, but it never crashes."""
     path = tmp_path / f"a{suffix}"
     record(path, 2)
     whole = path.read_bytes()

@@ -23,9 +23,7 @@ CONDITION = "output_current > 30"
 
 
 def batch(begin: int, end: int, true_at: range = range(0), key_at: int | None = None) -> Batch:
-    """Return a batch with two rows for each tenth of a second: a current, and the trigger's value (0 or
-    1).
-    """
+    """Return a batch with a current and the trigger's value, 0 or 1, for each tenth of a second."""
     rows = []
     for at in range(begin, end):
         ns = at * SECOND // 10

@@ -521,9 +521,7 @@ class FarEnds:
         self.happen()
 
     def stops_after(self, line: str) -> int:
-        """Return how many requests this line got after the abort's reason, up to and including the first
-        stop.
-        """
+        """Return the number of requests from the abort's reason to this line's first stop."""
         assert self.cause is not None
         later = self.requests[line][self.cause[line] :]
         return 1 + next(at for at, request in enumerate(later) if is_write(request))
@@ -609,9 +607,7 @@ FAMILIES = [model for model in (*MODELS, *SHIPPED) if find_model(model).stop is 
 @pytest.mark.long
 @pytest.mark.parametrize("model", FAMILIES)
 def test_each_familys_first_stop_of_an_abort_comes_within_two_bus_cycles(model: str, tmp_path: Path) -> None:
-    """The simulated drives count requests from the read of the high value to the first write, which is a
-    stop.
-    """
+    """The simulated drives count requests from the read of the high value to the first write."""
     family = find_model(model)
     numbers = [register.name for register in family.readings() if register.values is None and register.step]
     limited = "output_current" if "output_current" in numbers else "output_frequency"

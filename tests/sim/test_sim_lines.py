@@ -327,10 +327,7 @@ class MyCHE(InvtCHE):
 def mbpoll(
     sim: SimulatedDrive, options: str, *values: int, wait: str = "10"
 ) -> subprocess.CompletedProcess[str]:
-    """Run mbpoll once to read from this drive, or to write the values to it. `wait` is its timeout in s.
-
-    The option -P is none, because a pty stores no parity.
-    """
+    """Run mbpoll once to read from this drive, or to write the values. `wait` is its timeout in s."""
     program = require_program("mbpoll")
     baudrate, address = str(sim.drive.settings.baudrate), str(sim.drive.address)
     with Simulator([Wire([sim])]) as simulator:

@@ -119,9 +119,7 @@ class Wine:
         port.symlink_to(terminal)
 
     def begin(self) -> None:
-        """Start Wine's services without pipes, because the services would inherit pipes and keep them
-        open.
-        """
+        """Start Wine's services without pipes, which they would keep open."""
         line = ["wine", str(self.folder / "python" / "python.exe"), "-c", ""]
         subprocess.run(line, env=self.environment, check=True, timeout=PATIENCE_S, **NOWHERE)
 

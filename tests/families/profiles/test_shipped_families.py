@@ -490,10 +490,7 @@ def test_adjacent_registers_are_read_in_one_request_if_the_manual_allows_it() ->
 
 
 def installed(monkeypatch: pytest.MonkeyPatch, **values: str) -> None:
-    """Fake installed entry points, given as name="module:attribute".
-
-    `acme__` is a second entry point `acme`.
-    """
+    """Fake installed entry points `name="module:attribute"`; `acme__` is a second `acme`."""
     points = [EntryPoint(name.rstrip("_"), value, GROUP) for name, value in values.items()]
     monkeypatch.setattr(
         importlib.metadata, "entry_points", lambda **wanted: EntryPoints(points).select(**wanted)

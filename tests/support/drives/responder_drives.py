@@ -141,10 +141,7 @@ KINDS = {
 
 
 class ResponderDrive:
-    """One drive of a responder: its registers, and whether its motor turns.
-
-    After a stop the motor turns for another `ramp` seconds.
-    """
+    """A responder's drive: its registers, and its motor, which turns for `ramp` s after a stop."""
 
     def __init__(self, kind: Kind, address: int, ramp: float = 0.0) -> None:
         self.kind = kind

@@ -124,10 +124,7 @@ class SimulatedPumps:
         return float(self._ask("late"))
 
     def stops(self) -> dict[str, tuple[float | None, bool]]:
-        """Return, by drive, the time (CLOCK_MONOTONIC, s) of a stop's first frame; None if there was none.
-
-        The second value is True if the drive's motor turns or has a run command.
-        """
+        """Return the time of each drive's first stop frame, and whether its motor turns or should."""
         return {name: (at, turns) for name, (at, turns) in self._ask("stops").items()}
 
 

@@ -92,10 +92,7 @@ class Story:
         self.judge()
 
     def back_off_is_over(self) -> int:
-        """Run until every drive was polled again after the fault; return that time in ns.
-
-        Before that, the port must be reopened, and the pauses in polling silent drives must end.
-        """
+        """Run until every drive was polled again after the fault; return that time in ns."""
         cost = sum(drive.response_timeout for drive in self.drives) / 2  # s of timeouts per cycle, on average
         longest = max(schedule.LONGEST_REST_NS / S, cost / schedule.SILENT_SHARE)
         longest += Faults().away + polled_line.REOPEN_NS / S + poller.LOOK_NS / S
@@ -294,10 +291,7 @@ def bus_over(
 
 
 def read_truly(opened: Bus, line: PathLine, drives: Sequence[Drive]) -> None:
-    """Read four registers of each drive in turn, again and again.
-
-    Check that each value belongs to the register that was read.
-    """
+    """Read four registers of each drive in turn; check that each value belongs to its register."""
     asked = [(drive, register) for drive in drives for register in drive.readings()[:4]]
     read: Counter[str] = Counter()
     with opened:

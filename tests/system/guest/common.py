@@ -169,9 +169,7 @@ def write_plant(lines: dict[str, tuple[str, Iterable[int]]], more: str = "", eve
 
 
 class Poll:
-    """`multidrop poll` in a process. Each register of each drive has a different value, so that wrong values
-    are detected.
-    """
+    """`multidrop poll` in a process. Each register of each drive has a different value."""
 
     def __init__(self, lines: dict[str, tuple[str, Iterable[int]]]) -> None:
         self.out = Path(f"/tmp/poll-{time.monotonic_ns()}.csv")

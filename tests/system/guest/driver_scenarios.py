@@ -47,9 +47,7 @@ def _values(path: str, baudrate: int, format: str, **options: Any) -> list[float
 
 
 def settings(kind: str, wanted: list[tuple[int, str]]) -> list[dict[str, Any]]:
-    """Read two values at each port setting. Return the values, and the settings according to kernel and
-    adapter.
-    """
+    """Read at each port setting; return the values, and the settings of kernel and adapter."""
     adapter = plug.Adapter(kind, f"set-{kind}")
     facts = []
     for baudrate, format in wanted:
@@ -84,9 +82,7 @@ def rts(kind: str, mode: str, baudrate: int, count: int) -> dict[str, Any]:
 
 
 def rts_price(kind: str, baudrates: list[int], seconds: float, rounds: int) -> dict[int, dict[str, float]]:
-    """Read in turn with and without RTS that switches a transceiver. Return the median numbers of reads per
-    second.
-    """
+    """Return the median numbers of reads per second, with and without RTS switching."""
     adapter = plug.Adapter(kind, f"price-{kind}", sends_with=1)
     rates: dict[int, dict[str, list[float]]] = {
         baudrate: {mode: [] for mode in ("off", "rts-up", "rts-down")} for baudrate in baudrates
@@ -107,9 +103,7 @@ def rts_price(kind: str, baudrates: list[int], seconds: float, rounds: int) -> d
 
 
 def rts_in_stall(kind: str) -> dict[str, Any]:
-    """Read while the adapter accepts no bytes (a stall). Return its record of RTS during and after the
-    stall.
-    """
+    """Read while the adapter accepts no bytes; return its record of RTS until after this stall."""
     adapter = plug.Adapter(kind, f"still-{kind}", sends_with=1)
 
     def record() -> dict[str, Any]:
@@ -156,9 +150,7 @@ def doctor() -> dict[str, dict[str, list[str]]]:
 
 
 def lasting_names() -> dict[str, Any]:
-    """Return an adapter's link in /dev/serial/by-id, and what `scan --out` and `multidrop doctor` write about
-    its device path.
-    """
+    """Return an adapter's link in /dev/serial/by-id, and what two commands write about its path."""
     adapter = plug.Adapter("ftdi", "scanned", family=FAMILY, addresses=[1])
     out = Path("/tmp/scanned.toml")
     out.unlink(missing_ok=True)
@@ -211,9 +203,7 @@ def uart_modes() -> dict[str, Any]:
 
 
 def rs485_mode() -> dict[str, Any] | None:
-    """Read with the driver's RS-485 mode. Return the UART registers that it wrote, or None if the kernel
-    module is missing.
-    """
+    """Read in the driver's RS-485 mode; return the written UART registers, None without its module."""
     if subprocess.run(["modprobe", "rs485_uart"], check=False).returncode:
         return None
     plug.do("connect", {"serial": "uart"})

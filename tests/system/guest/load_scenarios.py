@@ -101,9 +101,7 @@ def _spread(times: Sequence[float]) -> dict[str, float]:
 
 
 def _polled(plant: str, seconds: float, *, realtime: bool) -> dict[str, Any]:
-    """Poll for `seconds` s. Return the rate, the times between requests, and the delays of flush_to_ldisc, in
-    ms.
-    """
+    """Poll for `seconds` s; return the rate, the gaps between requests and the kernel's delays in ms."""
     sent: set[int] = set()
     with Poller(plant, realtime=realtime) as poller, _traced_works() as late:
         begun = time.monotonic_ns() + round(WARM_UP_S * 1e9)

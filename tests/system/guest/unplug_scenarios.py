@@ -51,9 +51,7 @@ def poll_through_unplug(kinds: list[str], names: str) -> dict[str, Any]:
 
 
 def commands_while_unplugged(kind: str) -> dict[str, Any]:
-    """Call start, set_frequency and stop while the adapter of a running motor is unplugged. The stop must be
-    sent later.
-    """
+    """Call start, set_frequency and stop while the adapter of a running motor is unplugged."""
     adapter = plug.Adapter(kind, f"verbs-{kind}", family=FAMILY, addresses=[1])
     ended: dict[str, str] = {}
     with Bus(adapter.by_id) as bus:
@@ -119,9 +117,7 @@ def other_socket(is_anonymous: bool, names: str) -> dict[str, Any]:
 
 
 def doctor_without_serial_number() -> dict[str, Any]:
-    """Return what `multidrop doctor` says about an adapter without a serial number, and the adapter's links
-    in /dev/serial.
-    """
+    """Return what `doctor` says about an adapter without serial number, and its /dev/serial links."""
     adapter = plug.Adapter("ftdi", "anonymous", is_anonymous=True)
     _, text = run("doctor", adapter.path, "--json")
     findings = {finding["topic"]: finding for finding in json.loads(text)["findings"]}
