@@ -41,13 +41,13 @@ STANDING = {
 }
 AT_30_HZ = {**STANDING, "frequency": 30.0}
 
-# Columns: address, name, step and unit; factory value; changeable while running.
 TURNS = {
     FORWARD: {"output_frequency": 12.0, "status": YD1000Status.RUN},
     REVERSE: {"output_frequency": 12.0, "status": YD1000Status.RUN | YD1000Status.REVERSE},
     STOP: {"output_frequency": 0.0, "status": YD1000Status(0)},
 }
 
+# Columns: address, name, step and unit; factory value; changeable while running.
 PARAMETERS = """
 0000 automatic_ramp            1            0    Y
 0001 automatic_torque_boost    1            0    N
