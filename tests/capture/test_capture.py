@@ -44,9 +44,6 @@ Captured = tuple[Path, Path, list[Row]]
 READ = bytes.fromhex("01 03 00 16 00 01 65 CE")
 
 
-# ---- Wireshark reads our captures ----
-
-
 def registers(data: bytes) -> list[int]:
     return list(struct.unpack(f">{len(data) // 2}H", data))
 
@@ -110,9 +107,6 @@ def test_each_line_is_a_pcapng_interface_with_the_lines_name(tmp_path: Path) -> 
         "hall-1": 2,
         "Halle zwei": 1,
     }
-
-
-# ---- our reader, with captures of ours and of other programs ----
 
 
 def test_a_capture_is_read_back_with_the_written_frames(tmp_path: Path) -> None:
@@ -206,9 +200,6 @@ def test_time_stamps_of_any_resolution_are_read(tmp_path: Path, resolution: byte
     assert [span.time_ns for span in found] == [time_ns]
 
 
-# ---- write errors ----
-
-
 def test_a_capture_on_a_full_disk_raises_a_one_sentence_error(tmp_path: Path) -> None:
     if not Path("/dev/full").exists():
         pytest.skip("needs /dev/full")
@@ -237,9 +228,6 @@ def test_a_disk_that_becomes_full_leaves_whole_packets(tmp_path: Path) -> None:
         capture.write(READ, Side.ASKING, BEGIN + 2 * STEP, "hall-1")
     (found,) = spans(path).values()
     assert [span.time_ns for span in found] == [BEGIN, BEGIN + 2 * STEP]
-
-
-# ---- replay a capture: values at the captured times, silences, and drives that were not captured ----
 
 
 READ_REQUEST = Message(1, 3, 1, 1)  # the output frequency
@@ -298,9 +286,6 @@ def test_replay_of_a_drive_that_was_not_captured_is_silent(capture: Path) -> Non
 def test_replay_refuses_a_capture_of_other_drives(capture: Path) -> None:
     with pytest.raises(ValueError, match=r"hall\.pcapng has no exchange with other$"):
         Replay(capture, plant(Toy(2, name="other")))
-
-
-# ---- captures of a tcp:// line: Wireshark and the library decode them as Modbus/TCP ----
 
 
 FIELDS = ("mbtcp.trans_id", "mbtcp.unit_id", "modbus.func_code", "modbus.reference_num")
@@ -390,9 +375,6 @@ def test_a_decoded_capture_of_modbus_tcp_has_the_polled_values(captured: Capture
 
 
 NOT_ASKED = "not asked: drive is silent"
-
-
-# ---- files that are damaged, or are not captures ----
 
 
 def described(*options: tuple[int, bytes]) -> bytes:
@@ -533,9 +515,6 @@ def test_a_cut_capture_is_read_up_to_the_last_whole_packet(tmp_path: Path, forma
             assert capture.truncated < 300
     assert read == sorted(read, reverse=True)
     assert read[0] > read[-1] == 0
-
-
-# ---- files that are read in pieces, or change while they are read ----
 
 
 @pytest.mark.parametrize("piece", [200, 256, 333, 512])

@@ -73,9 +73,6 @@ def losing(*functions: int) -> Callable[[bytes], bytes]:
     return lambda reply: b"" if reply[1] in functions else reply
 
 
-# ---- reading ----
-
-
 @patient
 def test_a_value_is_read_in_its_unit() -> None:
     rig = simulated(Rig(1))
@@ -149,9 +146,6 @@ def test_baud_rate_and_format_of_a_bus_are_used_by_drives_without_their_own() ->
         assert str(bus.attach(Toy, 1).settings) == "19200 8N2"
         assert str(bus.attach(Toy, 2, baudrate=9600).settings) == "9600 8N2"
         assert str(bus.attach(Toy(3)).settings) == "9600 8N1"
-
-
-# ---- writing ----
 
 
 @patient
@@ -267,9 +261,6 @@ def test_an_invalid_argument_raises_before_any_frame_is_sent() -> None:
                 with pytest.raises(kind, match=re.escape(sentence)):
                     call(bus, ours)
     assert rig.counters.requests == rig.counters.broadcasts == 0
-
-
-# ---- failures on the line ----
 
 
 @pytest.fixture
@@ -399,9 +390,6 @@ def test_the_timeouts_of_a_drive_follow_its_manual(drive: Drive, least_ms: int, 
     assert (known.least_timeout_ns, known.most_timeout_ns) == (least_ms * 1_000_000, most_ms * 1_000_000)
 
 
-# ---- broadcasts ----
-
-
 @patient
 def test_a_broadcast_stop_stops_all_drives_of_one_family() -> None:
     drives = [simulated(InnovertIBD(address)) for address in (1, 2)]
@@ -410,9 +398,6 @@ def test_a_broadcast_stop_stops_all_drives_of_one_family() -> None:
             bus.attach(drive.drive)
         bus.broadcast(InnovertIBD.control, IBDControl.STOP)
     assert [drive.counters.broadcasts for drive in drives] == [1, 1]
-
-
-# ---- one bus for several drives and threads ----
 
 
 @pytest.mark.slow
@@ -467,9 +452,6 @@ def test_reads_on_a_bus_that_another_thread_closes_end_with_an_error() -> None:
             bus.close()
             for thread in threads:
                 thread.join()
-
-
-# ---- drives that are detached while a thread reads them ----
 
 
 class Single(Toy):

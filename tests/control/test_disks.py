@@ -41,9 +41,6 @@ def writes(ledger: Ledger) -> int:
     return sum(wear.writes for wear in ledger.wear(NOON))
 
 
-# ---- the audit log ----
-
-
 @pytest.mark.parametrize("room", range(0, 90, 10))
 def test_a_record_that_does_not_fit_on_the_disk_damages_no_other_record(tmp_path: Path, room: int) -> None:
     path = tmp_path / "audit.jsonl"
@@ -232,9 +229,6 @@ def test_an_audit_log_in_a_read_only_directory_is_refused_before_anything_is_sen
         one(InvtCHE(1), audit=directory / "audit.jsonl")
 
 
-# ---- the ledger ----
-
-
 @pytest.mark.parametrize("room", [0, 512, 4096, 8192, 12288])
 def test_the_eeprom_ledger_refuses_writes_while_the_disk_is_full(tmp_path: Path, room: int) -> None:
     ledger = Ledger(tmp_path / "wear.sqlite")
@@ -305,9 +299,6 @@ def test_setting_the_clock_back_does_not_restore_the_yearly_eeprom_budget(tmp_pa
         assert ledger.enter(CELL, NOON + at, 0.0) == ""
     for set_back in (HOUR, 86400.0, NOON):  # by NOON: to 1970, as on a board without a battery
         assert "10 times in a year" in ledger.enter(CELL, NOON - set_back, 0.0)
-
-
-# ---- ledger and audit log together, used by a drive ----
 
 
 @pytest.mark.long

@@ -561,9 +561,6 @@ def test_a_stop_by_a_plain_write_is_withheld_if_another_family_answers_twice(sus
     assert len(line.written) == 2 - suspicions
 
 
-# ---- drives that cannot identify themselves ----
-
-
 def count_silences(line: SimulatedBus) -> None:
     """Count missing replies, as the core does."""
     carry_out = line.carry_out

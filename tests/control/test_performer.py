@@ -291,9 +291,6 @@ def test_the_text_of_a_stops_result_includes_the_reason() -> None:
     assert str(Stopped("fan", Seen.SENT, 30.0, "no reply")) == "fan: sent but unknown after 30.0 s: no reply"
 
 
-# ---- lost ports and drives ----
-
-
 def test_a_port_lost_after_a_confirmed_start_raises_unconfirmed() -> None:
     line, drive, _ = one(InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(20)
@@ -330,9 +327,6 @@ def test_a_drive_detached_during_read_back_makes_the_write_unconfirmed() -> None
     Meanwhile(line, 1, lambda: line.bus.detach(drive))
     with pytest.raises(Unconfirmed, match=r"confirmed, but not read back: .*not attached"):
         drive.write(drive.setpoint, 10.0)
-
-
-# ---- the setpoint that the library believes the drive holds, after each possible outcome of a write ----
 
 
 UNREADABLE = [
@@ -446,9 +440,6 @@ def test_writing_the_setpoint_register_sets_the_known_setpoint() -> None:
     with pytest.raises(BusError):
         drive.write(drive.register("frequency"), 40)
     assert drive.commanded is None
-
-
-# ---- writes on several threads ----
 
 
 @pytest.mark.parametrize("later", [30.0, None])

@@ -103,8 +103,6 @@ def test_closing_a_bus_with_stop_on_exit_stops_motors_and_restores_handlers() ->
         assert set(written) <= {5, 8}  # 5 is repeated if a busy computer gets a reply late
 
 
-# ---- the ledger ----
-
 CELL = LedgerCell("/dev/ttyUSB0", 1, "delixi-modbus", "frequency")
 
 # The program pauses: without pauses, one of the two processes could hold SQLite's lock for too long.
@@ -158,8 +156,6 @@ def test_an_invalid_ledger_file_raises_a_one_sentence_error(tmp_path: Path) -> N
         Ledger(path).enter(CELL, 0.0, 60.0)
 
 
-# ---- the audit log ----
-
 WRITER = """
 import sys
 from multidrop.control.records import AuditLog
@@ -194,9 +190,6 @@ def test_a_truncated_line_of_the_audit_log_damages_no_other_line(tmp_path: Path,
     found = [each["write"] for each in read_audit(path)]
     assert found[-1] == "third"
     assert found == [name for name in ("first", "second") if name in found] + ["third"]
-
-
-# ---- an adapter that echoes ----
 
 
 @contextmanager
@@ -251,9 +244,6 @@ def test_an_echo_is_not_taken_for_the_reply_to_a_write() -> None:
         pump = bus.attach(InvtCHE(1))
         with pytest.raises(Unconfirmed, match="no reply"):
             pump.write(pump.setpoint, 50.0)
-
-
-# ---- an adapter that starts to echo when the drive dies ----
 
 
 DRIVES = (

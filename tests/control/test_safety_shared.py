@@ -202,9 +202,6 @@ def set_frequency(drive: Any, hz: float) -> None:
     until(lambda: attempt(lambda: drive.set_frequency(hz)) is None)
 
 
-# ---- at random ----
-
-
 class Stranger:
     """The other client. It reads both drives and writes the second drive's setpoint, but starts no motor."""
 
@@ -270,8 +267,6 @@ def starts(pair: SharedPair, model: str) -> list[Message]:
         request for request in requests(pair) if request.function in (5, 6, 15, 16) and STARTS[model](request)
     ]
 
-
-# ---- at the worst moment: our request is lost, and another frame arrives within our timeout ----
 
 PATIENCE = 0.1  # s; the shortest timeout that is long enough on a busy computer
 
@@ -384,9 +379,6 @@ def test_another_client_s_setpoint_is_seen_before_the_start() -> None:
         with pytest.raises(WriteForbidden, match=r"holds 100\.00 % and not 40\.00 %"):
             drive.start()
         assert not received[0].starts
-
-
-# ---- replies that are lost, damaged, doubled or cut off: no value is misattributed ----
 
 
 SEEDS = range(int(os.environ.get("HOSTILE_SEEDS", "1")))

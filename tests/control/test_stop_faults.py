@@ -49,8 +49,6 @@ def writes_to(line: SimulatedBus, address: int) -> int:
     return sum(is_write(request) and request.address == address for request, _ in line.frames)
 
 
-# ---- signals ----
-
 HOME = str(Path(multidrop.__file__).parent)
 # The first opcodes of a stop, before its `try`, call nothing. So the interpreter handles a signal that
 # arrives during them only at a later opcode, within the `try`.
@@ -196,9 +194,6 @@ def test_a_failed_staggered_start_stops_all_even_if_one_stop_raises(monkeypatch:
     assert [bool(sim.motor.goal) for sim in sims] == [True, False, False]
 
 
-# ---- no memory, no descriptors ----
-
-
 @table("fault", [NO_MEMORY, NO_DESCRIPTORS], ids=["memory", "descriptors"])
 @table("is_sent", [False, True])
 def test_a_stop_is_repeated_after_a_lack_of_memory_or_descriptors(
@@ -278,9 +273,6 @@ def test_the_error_of_a_stop_without_resources_names_the_reason(monkeypatch: pyt
     assert 5 <= line.seconds - begun < 6
 
 
-# ---- odd values ----
-
-
 @pytest.mark.parametrize("seconds", [Decimal(12), Fraction(12), 10**400], ids=["decimal", "fraction", "huge"])
 def test_a_stop_accepts_any_number_type_for_seconds(seconds: Any) -> None:
     line, drives, sims = che_drives(runs_s=10)
@@ -293,9 +285,6 @@ def test_a_stop_accepts_any_number_type_for_seconds(seconds: Any) -> None:
     else:
         drives[0].stop(seconds=seconds)
         assert not sims[0].motor.energised
-
-
-# ---- a ledger that is locked or cannot be written ----
 
 
 @pytest.mark.slow
@@ -336,9 +325,6 @@ def test_stop_is_sent_if_the_port_name_is_not_text(tmp_path: Path, caplog: pytes
     line.bus._records.flush(60)
     flush(60)
     assert "stops were not counted: " in caplog.text
-
-
-# ---- failures at each line of code of each family's stop ----
 
 
 FAMILIES: dict[str, Callable[[int], Drive]] = {

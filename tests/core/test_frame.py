@@ -70,9 +70,6 @@ def carry_out(framing: Framing, request: Message, received: bytes, piece: int = 
     return line.completion
 
 
-# ---- the documents' frames ----
-
-
 def test_every_printed_frame_is_parsed() -> None:
     # 19 replies equal their requests
     assert len({(each.framing, each.direction, each.frame) for each in PRINTED}) == 49 + 19
@@ -152,9 +149,6 @@ def test_the_longest_reply_is_read(framing: Framing, finish: Callable[[str], byt
     used, reply = parse_reply(framing, frame, Message(1, 0x03, 0, 125))
     assert (used, reply and reply.data) == (len(frame), data)
     assert parse_reply(framing, frame[:-1], Message(1, 0x03, 0, 125)) == (FrameFault.INCOMPLETE, None)
-
-
-# ---- wrong replies that other libraries accept as data ----
 
 
 def rtu(text: str) -> bytes:
@@ -254,8 +248,7 @@ def test_delixis_state_is_read_from_the_parameter_field_of_the_reply() -> None:
     assert (used, reply) == (21, Message(1, 3, 2, data=words(0, 2)))
 
 
-# ---- reads without addresses: the application protocol V1.1b3, 6.7, 6.13 and 6.21 ----
-
+# Frames of the application protocol V1.1b3, 6.7, 6.13 and 6.21.
 IDENTITY = b"\x0e\x01\x01\x00\x00\x02\x00\x03ABB\x01\x02X1"  # two objects: maker and product
 
 
@@ -287,8 +280,7 @@ def test_an_identification_of_another_kind_or_length_is_not_accepted_as_reply() 
     assert parse_reply(RTU, rtu(f"01 2B {long.hex()}"), message) == (FrameFault.BAD_LENGTH, None)
 
 
-# ---- the mask write and counters: the application protocol V1.1b3, 6.8 to 6.10, 6.16 and 6.18 ----
-
+# Frames of the application protocol V1.1b3, 6.8 to 6.10, 6.16 and 6.18.
 MASK = Message(0x11, 0x16, 0x0004, data=b"\x00\xf2\x00\x25")
 
 
@@ -318,9 +310,6 @@ def test_counters_logs_and_queues_are_read(request: Message, sent: str, reply: s
     assert (length, found and found.data) == (len(rtu(reply)), data)
     for end in range(len(rtu(reply))):
         assert parse_reply(RTU, rtu(reply)[:end], request) == (FrameFault.INCOMPLETE, None)
-
-
-# ---- messages that no frame can carry ----
 
 
 @table(
@@ -402,9 +391,6 @@ def test_a_number_too_large_for_its_field_raises(odd: dict[str, int]) -> None:
 @table("framing", [RTU, ASCII])
 def test_the_reply_length_of_a_broadcast_is_0(framing: Framing) -> None:
     assert reply_length(framing, Message(0, 6, 0x2000, 1, data=b"\0\1")) == 0
-
-
-# ---- checksums ----
 
 
 CHECK = b"123456789"

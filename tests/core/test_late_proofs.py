@@ -168,9 +168,6 @@ def test_a_reply_is_found_after_noise_before_its_request(line: LineDriver, drive
     assert line.data_after(build_reply(Framing.RTU, Message(1, 4, data=words(2222)))) == words(2222)
 
 
-# ---- sure replies can only be to the last request: the core checks the driver's count of unsent bytes ----
-
-
 def has_sure_reply(line: LineDriver, drive: Peer) -> bool:
     ask(line, drive, READ)
     line.receive(reply(1))
@@ -193,9 +190,6 @@ def test_no_reply_is_in_doubt_after_an_answered_proof(line: LineDriver, drive: P
     line.send(proof)
     line.receive(PROOF_REPLY)
     assert has_sure_reply(line, drive)
-
-
-# ---- the first reply to this process ----
 
 
 @pytest.fixture

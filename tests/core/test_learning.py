@@ -166,8 +166,6 @@ def test_a_write_waits_at_least_its_own_timeout_for_its_reply(line: LineDriver, 
     assert line.now - left == 1000 * MS + 8 * CHARACTER
 
 
-# ---- no byte within the timeout ----
-
 AWAITED = 3 * CHARACTER  # the wait for the first character, plus two more
 LONG = Message(1, 3, 0, 100)  # its reply has 205 characters
 
@@ -243,9 +241,6 @@ def test_a_reply_after_a_shortened_wait_is_recognised_as_late(line: LineDriver, 
     assert is_barred(line, drive, OTHER)
     line.receive(reply(1111))
     assert (drive.counters().late, drive.late_until_ns) == (1, 0)
-
-
-# ---- late replies ----
 
 
 def test_no_request_is_sent_while_a_late_reply_could_pass_for_its_own(line: LineDriver, drive: Peer) -> None:
@@ -538,9 +533,6 @@ def test_counters_include_every_exchange(line: LineDriver, drive: Peer) -> None:
     assert (counters.exchanges, counters.answered, counters.values, counters.exceptions) == (4, 2, 1, 1)
     assert counters.missed == {Status.NO_REPLY: 1, Status.LATE_ANSWER_DUE: 1}
     assert (counters.stray_bytes, counters.late) == (1, 0)
-
-
-# ---- reads for a waiting client: one wake-up, when the reply is whole ----
 
 
 FIELDS = RowLayout(0, [Field(0, NumberFormat.U16, 0, 1.0, 1.0)])

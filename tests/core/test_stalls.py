@@ -257,9 +257,6 @@ def test_closing_a_port_cancels_a_command_in_flight(ends: Ends, port: Port) -> N
     assert (found[0].result, port.called_off) == (Failure.LINE_LOST, True)
 
 
-# ---- a driver that counts bytes as unsent although the adapter has sent them ----
-
-
 def patient(message: Message) -> Exchange:
     return exchange(message, timeout=PATIENCE)
 

@@ -173,9 +173,6 @@ def test_modbus_device_reads_many_registers_in_several_requests(meter: BusAndDev
     assert [(request.start, request.count) for request, _ in line.frames] == [(0, 124), (124, 124), (248, 32)]
 
 
-# ---- `Drive.read`, `write` and similar methods of attached and unattached drives ----
-
-
 class Tank(Drive):
     """A drive with two readings at neighbouring addresses, a setting, and a text register."""
 

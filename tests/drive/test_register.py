@@ -170,9 +170,6 @@ def test_integer_too_large_for_a_float_is_refused(name: str, number: int) -> Non
         Example.register(name).encode(number)
 
 
-# ---- line settings ----
-
-
 @table(
     ("baudrate", "format", "bits"),
     [
@@ -211,9 +208,6 @@ def test_invalid_character_format_is_refused(format: str) -> None:
 def test_baud_rate_outside_the_limits_is_refused(baudrate: int) -> None:
     with pytest.raises(ValueError, match="baud rate"):
         Settings(baudrate, "8N1")
-
-
-# ---- a drive's state from known values, computed again only if it may have changed ----
 
 
 RUNS, STANDS = State(Condition.RUNNING), State(Condition.STOPPED)
@@ -301,9 +295,6 @@ def test_fault_gets_its_name_once_the_fault_code_is_read() -> None:
     named = reader.state({"status": 4.0, "fault": 4.0})
     assert named == State(Condition.FAULT, fault="overcurrent while accelerating (OC1)")
     assert reader.state({"status": 4.0}) == State(Condition.FAULT)
-
-
-# ---- texts: characters in registers, read on demand ----
 
 
 METER = """\
@@ -460,9 +451,6 @@ def test_command_line_prints_text_registers_and_marks_missing_values(run: RunCom
     printed = run("models", model)[1]
     assert "0014H  serial  input register  8 characters  section 2" in printed
     assert "no value: 7FFFH" in printed
-
-
-# ---- titles of registers in Russian and Chinese, and the choice of a language ----
 
 
 UNTRANSLATED = {  # the documents do not explain these registers

@@ -126,9 +126,6 @@ def test_a_changed_plant_starts_a_new_segment(tmp_path: Path, writers: Writers) 
         assert history.metadata() == {"plant": "other.toml"}
 
 
-# ---- a disk that is full, slow, or gone ----
-
-
 def test_a_full_disk_is_reported_and_recording_continues(
     tmp_path: Path, writers: Writers, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -223,9 +220,6 @@ def test_an_exception_in_the_history_writers_thread_does_not_end_it(
     until(lambda: writer.state().rows == 40)
 
 
-# ---- compaction and retention ----
-
-
 @pytest.mark.long
 def test_closed_segments_are_compacted_and_old_files_removed(tmp_path: Path, writers: Writers) -> None:
     pytest.importorskip("duckdb", reason="needs duckdb")
@@ -310,9 +304,6 @@ def test_files_whose_segments_are_all_in_a_merged_file_are_omitted() -> None:
     assert [(one.first, one.last) for one in widest(files)] == [(1, 144), (145, 145)]
 
 
-# ---- SIGKILL of recorders and compaction at any moment: no written row is missing or doubled ----
-
-
 SUPPORT = os.pathsep.join(map(str, Path(histories.__file__).parents[1].iterdir()))
 
 
@@ -383,9 +374,6 @@ def test_killing_the_recorder_and_compaction_loses_no_row(tmp_path: Path, kills:
     with History(tmp_path) as history:
         assert check_runs(history, written) == total
         assert total_of_tens(history, kills) == total
-
-
-# ---- the gateway's historian: settings, rows from polling, and answers to requests ----
 
 
 MS = 1_000_000

@@ -186,9 +186,6 @@ def test_a_parameter_is_written_to_eeprom_even_if_its_register_has_a_ram_address
     assert (ramp.name, ramp.ram_address, ramp.kept, ramp.table) == ("ramp", None, Kept.EEPROM, HOLDING)
 
 
-# ---- parameter files: saved values load again, and an invalid file raises a one-sentence error ----
-
-
 GD20 = "GRUPO_PARAMETRO;CODIGO_FUNCAO;VALOR_PARAMETRO"
 FOUND = params.ParameterSet(
     "yd1000", {"0009": 100, "F240": 7}, source="pump-1", title="YD1000", firmware="104", saved="2026-11-29"

@@ -198,9 +198,6 @@ def test_multidrop_poll_reads_all_values_of_another_server(name: str, tmp_path: 
     assert {(row.register, row.value) for row in rows if row.value is not None} == set(HELD.items())
 
 
-# ---- a client that we did not write reads simulated drives ----
-
-
 def mbpoll(port: str, address: int, options: str, *values: int) -> subprocess.CompletedProcess[str]:
     place = urlsplit(port)
     command = [require_program("mbpoll"), "-q", "-m", "tcp", "-p", str(place.port), "-o", "5", "-0"]
@@ -221,9 +218,6 @@ def test_mbpoll_reads_and_writes_a_simulated_family_over_tcp() -> None:
         assert "Illegal data address" in refused.stderr
         assert mbpoll(port, 1, "-r 107 -t 4", 200).returncode == 0
     assert pump["acceleration_time"] == 20
-
-
-# ---- poll a meter of 40 values, simulated by pymodbus, through its family file ----
 
 
 FAMILY = Path(__file__).parents[1] / "data" / "families" / "sdm630.toml"

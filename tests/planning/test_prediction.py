@@ -167,9 +167,6 @@ def test_prediction_adds_the_delay_of_the_computer_to_each_exchange() -> None:
     assert predict_with_host(exchanges).cycle == pytest.approx(predict(exchanges).cycle + 4 * LATENESS)
 
 
-# ---- compared with the core's line, on a clock that the test sets ----
-
-
 def carried_out(exchanges: Sequence[Planned]) -> float:
     """Return the seconds of a bus cycle in the C core if every drive has its documented response delay."""
     drives = in_order(dict.fromkeys(exchange.drive for exchange in exchanges))
@@ -237,9 +234,6 @@ def test_predicted_rates_need_no_more_time_than_the_line_has(wanted: list[tuple[
         assert rate.every is None or rate.reached * rate.every <= 1.01
 
 
-# ---- suggestions ----
-
-
 def with_suggestion(drives: list[Drive], found: Suggestions, every: float, which: str) -> list[Planned]:
     if which == "every":
         ((old, new),) = found.every
@@ -304,9 +298,6 @@ def test_suggested_changes_as_text_form_one_sentence() -> None:
         f"it would fit with {every}, or baudrate = 19200 for fan-1, fan-2, "
         "or at most 3 of these registers for each drive"
     )
-
-
-# ---- suggested readable gaps ----
 
 
 SUPPORT = Path(__file__).parents[1] / "support" / "drives"

@@ -618,9 +618,6 @@ def test_keys_ram_and_confirmed_of_a_plant_file_reach_the_drive(tmp_path: Path) 
         load_plant(path)
 
 
-# ---- other ports, and names ----
-
-
 def two_lines(directory: Path) -> Path:
     path = directory / "plant.toml"
     line = '[[line]]\nname = "{0}"\nport = "/dev/{0}"\n[[line.drive]]\nname = "pump-{1}"\n'
@@ -696,9 +693,6 @@ def test_second_star_in_a_poll_list_is_reported(mistakes: Mistakes) -> None:
     assert sentence.endswith('poll number 2: "*" is there twice; keep it once')
 
 
-# ---- names of drives: Unicode normal forms, which differ between keyboards; reserved names ----
-
-
 # Letters with a composed and a decomposed Unicode encoding, from the code charts.
 COMPOSED, APART = "L\u00fcfter", "Lu\u0308fter"
 SHORT, LONG = "\u0439", "\u0438\u0306"
@@ -738,9 +732,6 @@ def test_drive_names_similar_to_reserved_ones_are_allowed(name: str) -> None:
 
 def test_no_option_of_a_family_file_has_the_name_of_a_plant_file_key() -> None:
     assert set(DRIVE_KEYS) <= NOT_OPTIONS
-
-
-# ---- computed channels of a plant file: the loaded channels, and the place of each mistake ----
 
 
 FILE = """\

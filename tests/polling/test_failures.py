@@ -171,9 +171,6 @@ def test_requests_queued_when_a_line_failed_are_sent(two: Two, monkeypatch: pyte
     assert {row.drive for row in rows_of(two.poller)} <= {"ill", "well"}
 
 
-# ---- the poller's own thread ----
-
-
 def test_a_brief_lack_of_memory_does_not_end_polling(two: Two, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as short:
         left = [MemoryError()] * 3
@@ -257,9 +254,6 @@ def test_a_wait_for_batches_ends_when_polling_fails(two: Two, monkeypatch: pytes
     two.poller._is_failure_raised = True
 
 
-# ---- threads that reopen ports, bridge bytes or log ----
-
-
 def test_a_failed_reopening_of_a_port_is_logged_and_retried(
     two: Two, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -327,9 +321,6 @@ def test_system_exit_in_a_log_handler_ends_no_logging(two: Two, caplog: pytest.L
     until(lambda: "second" in caplog.text)
 
 
-# ---- valid functions of `on_batch` ----
-
-
 async def wait(batch: object) -> None:
     """Do nothing. A call without `await` only creates a coroutine."""
 
@@ -393,9 +384,6 @@ def test_an_exception_of_a_users_drive_class_affects_only_its_line(monkeypatch: 
             failing.set()
             until(lambda: poller.line_failures == {"ill": "ZeroDivisionError: a bug of its author"})
             failing.clear()
-
-
-# ---- a poller's callback for batches: its thread, its failures, and its end ----
 
 
 @pytest.fixture

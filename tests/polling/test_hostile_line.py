@@ -177,9 +177,6 @@ def test_resources_do_not_grow_over_hours_of_faults() -> None:
     assert seen[-1][1:] == seen[0][1:]
 
 
-# ---- all families on one line: no value is taken for the value of another drive ----
-
-
 REAL_SECONDS = 4.0
 EVERY = 1.0  # period in s of the registers that have a rate
 
@@ -265,9 +262,6 @@ def test_late_lost_and_doubled_replies_are_never_misattributed() -> None:
     assert summary["samples"] > 0
     assert summary["misses"]["no reply"] > 0
     assert summary["stray_bytes"] > 0
-
-
-# ---- a lost request, if no later reply can show that no late reply is due ----
 
 
 POLLED = bytes((1, 3, 0, 1, 0, 1))  # output_frequency

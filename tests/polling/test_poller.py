@@ -136,9 +136,6 @@ def port(pump: SimulatedDrive) -> Iterator[str]:
         yield sim.wires[0].path
 
 
-# ---- rates ----
-
-
 @pytest.mark.slow
 def test_requests_with_a_period_are_sent_in_their_time_slots_without_bursts(port: str) -> None:
     periods = {"output_current": 0.02, "output_frequency": 0.05}
@@ -189,9 +186,6 @@ def test_drives_with_equal_line_settings_are_polled_in_a_row(kinds: list[dict[st
     assert len(list(itertools.groupby(asked, lambda at: at % 2))) == 2
 
 
-# ---- rows ----
-
-
 def test_batches_yields_rows_for_the_given_seconds(port: str) -> None:
     with Poller(plant(line(port, polled(drive(), READINGS)))) as poller:
         rows: list[Row] = []
@@ -230,9 +224,6 @@ def test_dropped_rows_of_the_bounded_queue_are_counted(port: str, monkeypatch: p
     summary = poller.summary()
     assert len(rows) <= 400
     assert len(rows) + summary["dropped"] == summary["samples"] + summary["misses"]
-
-
-# ---- several lines; commands ----
 
 
 @contextmanager
@@ -294,9 +285,6 @@ def test_commands_are_carried_out_while_the_line_is_polled(port: str, pump: Simu
         with pytest.raises(ValueError, match=r"^there is no line 'hall-2'; there are hall-1$"):
             polling.poller.bus("hall-2")
     polling.check("ok")
-
-
-# ---- faults in the poll's rows ----
 
 
 def reply_of(address: int, reply: bytes) -> bytes:
@@ -510,9 +498,6 @@ def test_a_drive_that_returns_after_a_silence_is_polled_again(pump: SimulatedDri
     polling.check("ok")
 
 
-# ---- the end ----
-
-
 def test_a_plant_without_lines_can_be_polled() -> None:
     with Poller(plant()) as poller:
         assert poller.fileno() >= 0
@@ -657,9 +642,6 @@ def test_a_line_can_be_closed_right_after_its_port_was_reopened() -> None:
         assert clocked.port
         tended._lose(clocked.port, clocked.now)
         tended.bus.line.reopen()
-
-
-# ---- memory of a polling process: it must fit small machines ----
 
 
 MOST_MB = 30.0

@@ -40,9 +40,6 @@ def values(rows: list[Row]) -> dict[str, float]:
     return {row.register: row.value for row in rows if row.value is not None}
 
 
-# ---- halves ----
-
-
 def test_splitting_a_block_separates_no_registers_that_must_be_read_together() -> None:
     class Kind(Drive):
         read_together = (("high", "low"),)
@@ -64,9 +61,6 @@ def test_splitting_a_block_separates_no_registers_that_must_be_read_together() -
             ends.append({register.name for register in block.registers})
     assert sorted(map(sorted, ends)) == [["a", "same"], ["b"], ["between"], ["high", "low"], ["long"]]
     assert made == 2 * len(ends) - 2
-
-
-# ---- polled ----
 
 
 @pytest.mark.slow
@@ -130,9 +124,6 @@ def test_attempts_to_read_a_split_block_as_a_whole_add_no_rows(monkeypatch: pyte
         rows = clocked.run(10)
     assert 5 <= Counter(sim.asked)[0, WIDE] <= 12
     assert {row.status for row in rows} == {"ok"}
-
-
-# ---- silent to long requests ----
 
 
 @pytest.mark.long
@@ -222,9 +213,6 @@ def test_every_register_that_can_be_read_alone_is_polled(refused: set[int], most
     assert values(rows) == expected_values(set(range(6)) - refused)
 
 
-# ---- refused registers ----
-
-
 POLLED = ("output_frequency", "output_current", "mystery", "fault", "status")
 REFUSED = Toy.mystery
 
@@ -294,9 +282,6 @@ def test_a_block_that_becomes_readable_again_is_polled_as_before(
         assert clocked.poller.summary()["lines"]["line"]["set_aside"] == []
     assert {row.status for row in rows} == {"ok"}
     assert len(rows) > before / 4
-
-
-# ---- values that the document declares as invalid ----
 
 
 ANSWERED = ("ok", "no valid value")  # other statuses are possible on a busy computer
@@ -405,9 +390,6 @@ def test_registers_written_by_function_16_are_read_together_with_other_registers
     sim = SimulatedDrive(Controller(1))
     sim["level"], sim["target"] = 3, 4
     assert sim.read(3, 0, 2) == [3, 4]
-
-
-# ---- reads that A1000 and CP2000 drives refuse: learnt without options, and other values are still read ----
 
 
 ILLEGAL_ADDRESS, ILLEGAL_VALUE = 2, 3

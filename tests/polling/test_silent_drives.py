@@ -129,9 +129,6 @@ def test_drives_dead_from_the_start_hardly_slow_others(count: int, dead: int, ev
     assert later >= 0.98 * without_later
 
 
-# ---- blocks of a drive that answers sooner or later than documented are planned again ----
-
-
 SOON, LATE = 0.005, 0.06  # short and long response delay in s
 
 

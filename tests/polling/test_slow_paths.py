@@ -260,9 +260,6 @@ def test_no_value_is_misattributed_over_a_slow_path_with_other_faults(kind: str)
     story.run_over(stalling(3.0))
 
 
-# ---- Modbus TCP: late, doubled and reordered replies ----
-
-
 TCP = "tcp://test-line:502"
 FAMILIES = {family.model: family for family in (ErmanERG220, InvtCHE, InnovertIBD, DelixiModbus, YD1000)}
 TCP_PATHS = [

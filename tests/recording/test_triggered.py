@@ -128,9 +128,6 @@ def test_trigger_recording_keeps_only_the_rows_of_the_pre_trigger_time(writer: T
     assert len(writer._before) < 40
 
 
-# ---- the column `phase` of a test run's recording, in each format and after conversion ----
-
-
 NAMES = ["warm up", "cool", "stop"]
 EXPECTED = ["", "warm up", "warm up", "warm up", "cool", "cool", "warm up"]
 

@@ -244,9 +244,6 @@ def test_every_key_of_a_test_file_is_documented() -> None:
     assert [key for key in keys if f"\n| `{key}` | " not in page] == []
 
 
-# ---- rows are compared with a run's limits, without a port and on a clock that the test sets ----
-
-
 S = 10**9
 TEXT = """
 [abort]

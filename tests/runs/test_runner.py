@@ -386,8 +386,6 @@ def test_a_busy_computer_aborts_only_the_run_of_a_real_drive(
     assert next(attempts) == (1 if is_real else 6)  # six: three attempts too late, and three steps
 
 
-# ---- the first stop of an abort, counted in requests at the far ends ----
-
 WAIT = 'dwell = "2 min"'
 WAITING = """
 [abort]
@@ -657,8 +655,6 @@ def _note(sim: MotorDrive, are_writes: list[bool], on_write: Callable[[], object
 
     vars(sim)["receive"] = noting
 
-
-# ---- interruptions, and lost ports ----
 
 SHORT = STEPS.replace('"2 s"', '"300 ms"')
 LONG = SHORT.replace("[20.0, 30.0]", str([20.0, 30.0] * 60))  # a setpoint every 300 ms, for 36 s

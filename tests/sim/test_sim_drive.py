@@ -270,9 +270,6 @@ def test_value_of_a_simulated_drive_can_be_set_by_name_or_as_text() -> None:
         sim["fault"] = "three"
 
 
-# ---- the simulated motor's physics on simulated time ----
-
-
 RATING = Rating(frequency=50, voltage=400, current=10, power=4, torque=26, pole_pairs=2)
 
 

@@ -217,9 +217,6 @@ def test_terminated_simulator_process_removes_its_link(tmp_path: Path) -> None:
     assert not link.is_symlink()
 
 
-# ---- the simulator's thread: it ends on request, and a failing drive affects no other wire ----
-
-
 PATIENCE = 60.0
 
 
@@ -315,9 +312,6 @@ def test_option_speed_makes_simulated_time_pass_faster() -> None:
 def test_simulator_speed_that_is_not_positive_is_refused(speed: float) -> None:
     with pytest.raises(ValueError, match="is not a positive number"):
         Simulator([], speed=speed)
-
-
-# ---- masters by other authors read and write simulated drives: mbpoll over RTU, pymodbus over ASCII ----
 
 
 class MyCHE(InvtCHE):

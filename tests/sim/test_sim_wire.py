@@ -245,9 +245,6 @@ def test_path_of_a_simulated_wire_that_is_not_open_raises_runtime_error() -> Non
         _ = Wire([simulated(Own(1))], name="hall-1").path
 
 
-# ---- split received bytes into requests; the frames are printed in the families' documents ----
-
-
 CHARACTER = 1e-3
 GAP = 3.5e-3
 

@@ -273,9 +273,6 @@ def test_a_port_that_leads_to_another_line_is_not_polled_and_gets_no_stop(
     assert caplog.text.count("not opened again: another adapter") == 1
 
 
-# ---- lost ports: the reported reason, a stalled adapter, baud rates that a UART cannot have ----
-
-
 @table(
     ("port", "error", "why"),
     [
@@ -447,9 +444,6 @@ def test_an_unsent_read_does_not_lose_a_stalled_port(terminal: str, monkeypatch:
         with pytest.raises(NoReply, match=f"but the port is {STALLED}"):
             toy.read(toy.output_current)
         assert not bus.line.is_lost
-
-
-# ---- baud rates ----
 
 
 @table(

@@ -189,9 +189,6 @@ def test_the_result_memory_of_a_failed_read_is_not_reused(bus: Bus, monkeypatch:
     assert len(set(asked)) == len(asked) >= 2
 
 
-# ---- decoding ----
-
-
 class Mode(IntEnum):
     OFF = 0
     ON = 1
@@ -284,9 +281,6 @@ def test_the_core_decodes_floats() -> None:
 def test_drives_of_a_model_share_decoders_only_for_equal_blocks() -> None:
     assert decoder_of(Block.of(Mixed(2), REGISTERS)) is decoder()
     assert decoder_of(Block.of(Mixed(2), REGISTERS[1:])) is not decoder()
-
-
-# ---- if a drive refuses or ignores a read as a whole, `Bus` splits it, without losing a register ----
 
 
 WIDE = 24
@@ -403,9 +397,6 @@ def test_a_foreign_reply_to_only_one_attempt_is_reported(silent: set[int]) -> No
     bus.answers = lambda request: foreign
     with pytest.raises(BadReply, match="another address"):
         drive.read_many(drive.registers.values())
-
-
-# ---- `Drive.read_raw`: raw reads of any address, which never write ----
 
 
 @pytest.fixture

@@ -141,9 +141,6 @@ def test_a_failure_to_switch_rts_loses_the_port_and_ends_sending(driver: Path) -
     assert "write" not in [event.what for event in events[broken:]]
 
 
-# ---- without the simulated driver: a pseudo-terminal has no RTS ----
-
-
 def test_a_poller_raises_immediately_if_rts_cannot_be_switched(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(open_port, "is_pseudo_terminal", lambda device: False)
     with Simulator([Wire([simulated(Toy(1))])]) as sim:

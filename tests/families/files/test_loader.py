@@ -56,9 +56,6 @@ def facts(register: Register[Any]) -> dict[str, Any]:
     return found
 
 
-# ---- the resulting class ----
-
-
 def test_class_from_a_family_file_equals_the_hand_written_class(tmp_path: Path) -> None:
     loaded = load_family(write_meter(tmp_path))
     assert {name: facts(one) for name, one in loaded.registers.items()} == {
@@ -150,8 +147,6 @@ def test_addresses_of_a_family_file_may_be_unit_ids_0_to_255(tmp_path: Path) -> 
             loaded(unit).take_framing_of("/dev/ttyUSB0")
     assert any("addresses = [0, 256]" in one for one in mistakes(tmp_path, head.replace("255", "256")))
 
-
-# ---- mistakes ----
 
 TWENTY = """\
 [family]
@@ -480,8 +475,6 @@ def test_mistakes_in_text_registers_are_reported(tmp_path: Path, entry: str, exp
     assert any(expected in mistake for mistake in found), found
 
 
-# ---- parameters ----
-
 RULE = """[setting]
 ramp = { at = "0001H", unit = "s", step = 0.1 }
 [parameters]
@@ -582,9 +575,6 @@ power_of_ten = { at = 10, number_format = "I16", order = "ABCD" }
     assert (count.number_format, count.order, count.invalid) == (NumberFormat.U64, "DCBA", (0,))
     assert (found["flag"].part, found["field"].part) == ((3, 3), (4, 7))
     assert found["current"].scaled_by is found["power_of_ten"]
-
-
-# ---- damaged family files either load or are refused with sentences ----
 
 
 SEEDS = list(seeds.family())

@@ -236,9 +236,6 @@ def test_status_word_of_a_profile_is_decoded_to_the_condition(
     assert wire(model, status, **says).drive.state().condition is condition
 
 
-# ---- behaviour of single profiles ----
-
-
 @table(
     ("model", "running"),
     [
@@ -309,8 +306,6 @@ def test_profidrive_drive_that_does_not_become_ready_is_switched_off() -> None:
         found.drive.start()
     assert sent(found) == [ABB + "04 76", ABB + "04 77", ABB + "04 7E"]
 
-
-# ---- a family with its own numbers for INVT's words ----
 
 EXCHANGED = {"forward": 1, "reverse": 2, "stop": 6, "coast": 5, "reset_fault": 7}
 
