@@ -14,7 +14,7 @@ from simulated_bus import SimulatedBus, one
 
 from multidrop.control.ramp import start_staggered
 from multidrop.control.records import read_audit, written_by
-from multidrop.core import Completion, Exchange, Framing, Message, build_reply
+from multidrop.core import Completion, Exchange
 from multidrop.drive import Condition
 from multidrop.errors import BusError, DriveException, LineError, Unconfirmed
 from multidrop.families import YD1000, InvtCHE
@@ -24,8 +24,7 @@ from multidrop.transport.aside_log import flush
 
 def test_a_refused_raw_request_is_recorded_as_refused(tmp_path: Path) -> None:
     line, drive, _ = one(InvtCHE(1), audit=tmp_path / "audit")
-    refusal = build_reply(Framing.RTU, Message(1, 6, exception=0x12))
-    line.answers = lambda request: refusal if request.function == 6 else None
+    line.refuses = lambda request: 0x12 if request.function == 6 else 0
     with pytest.raises(DriveException, match="code 12H"):
         drive.send_raw(6, 0x1000, b"\0\5")
     line.bus.close()

@@ -99,10 +99,7 @@ def test_stop_all_sends_no_broadcast_if_the_family_defines_no_broadcast() -> Non
 def test_stop_all_reports_failed_if_neither_broadcast_nor_stop_was_sent(models: tuple[str, str]) -> None:
     line, _, _ = line_of(*models)
 
-    def lose(request: Message) -> bytes | None:
-        raise PortLost("hall", "there is no such port")
-
-    line.answers = lose
+    line.fails = lambda request: PortLost("hall", "there is no such port")
     assert {told.seen for told in line.bus.stop_all(seconds=1.0).values()} == {Seen.FAILED}
 
 
@@ -289,13 +286,8 @@ def test_a_setpoint_is_not_broadcast_if_a_drive_may_have_been_replaced() -> None
 def test_a_stop_that_was_only_broadcast_is_reported_as_sent() -> None:
     """The port is lost after the broadcast, so no stop is sent to a single drive."""
     line, _, _ = line_of("invt-che", "invt-che")
-
-    def lose(request: Message) -> bytes | None:
-        if broadcasts(line) and request.address:
-            raise PortLost("hall", "the port was lost (hung up)")
-        return None
-
-    line.answers = lose
+    lost = PortLost("hall", "the port was lost (hung up)")
+    line.fails = lambda request: lost if broadcasts(line) and request.address else None
     for told in line.bus.stop_all(seconds=1.0).values():
         assert told.seen is Seen.SENT
         assert "sent 1 times, it was never confirmed" in told.why
@@ -304,12 +296,7 @@ def test_a_stop_that_was_only_broadcast_is_reported_as_sent() -> None:
 def test_notes_of_an_interrupted_stop_all_count_the_broadcast_stop() -> None:
     line, _, _ = line_of("invt-che", "invt-che")
 
-    def press(request: Message) -> bytes | None:
-        if broadcasts(line) and request.address:
-            raise KeyboardInterrupt
-        return None
-
-    line.answers = press
+    line.fails = lambda request: KeyboardInterrupt() if broadcasts(line) and request.address else None
     with pytest.raises(KeyboardInterrupt) as interruption:
         line.bus.stop_all()
     told = "the stop was sent 1 to 2 times; the motor is not seen to stand"
@@ -387,12 +374,8 @@ def test_each_drive_is_stopped_if_the_broadcast_fails() -> None:
     """The port is lost during the broadcast, and comes back."""
     line, _, sims = che_drives(2, runs_s=0)
 
-    def fails(request: Message) -> bytes | None:
-        if request.address == 0:
-            raise LineError("hall", "the port was lost (hung up)")
-        return None
-
-    line.answers = fails
+    lost = LineError("hall", "the port was lost (hung up)")
+    line.fails = lambda request: lost if request.address == 0 else None
     stopped = line.bus.stop_all()
     assert {each.seen for each in stopped.values()} == {Seen.STOPPED}
     assert {frame[:17] for frame in line.written} >= {"01 06 10 00 00 05", "02 06 10 00 00 05"}

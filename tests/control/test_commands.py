@@ -39,7 +39,6 @@ from multidrop.control.commands import (
     write_register,
 )
 from multidrop.control.outcome import CommandOutcome, CommandResult
-from multidrop.core import Message, build_reply
 from multidrop.errors import NotAttached
 from multidrop.sim import simulated
 from multidrop.supervisor import Supervisor
@@ -64,12 +63,8 @@ def test_a_stop_has_the_outcome_done_unknown_or_failed(way: str) -> None:
     line.loses = is_write
     assert STOPS[way](drive)[drive.name].outcome is CommandOutcome.UNKNOWN
 
-    def refuse(request: Message) -> bytes | None:
-        refusal = Message(request.address, request.function, request.start, exception=1)
-        return build_reply(drive.framing, refusal) if is_write(request) else None
-
     line, drive, _ = one(InnovertIBD(1))
-    line.answers = refuse
+    line.refuses = lambda request: 1 if is_write(request) else 0
     result = STOPS[way](drive)[drive.name]
     assert result.outcome is CommandOutcome.FAILED
     assert "refuses" in result.text

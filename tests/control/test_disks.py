@@ -162,10 +162,7 @@ def test_an_interrupted_stop_is_recorded_as_sent_but_unknown(tmp_path: Path) -> 
     line, drive, _ = one(InvtCHE(1, maximum_frequency=50), audit=path)
     line.bus.check_identity(drive)
 
-    def press(request: Message) -> bytes | None:
-        raise KeyboardInterrupt
-
-    line.answers = press
+    line.fails = lambda request: KeyboardInterrupt()
     with pytest.raises(KeyboardInterrupt):
         drive.stop()
     line.bus.close()

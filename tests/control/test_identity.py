@@ -333,12 +333,7 @@ def test_an_identity_check_by_undocumented_registers_never_withholds_a_stop() ->
     bus = SimulatedBus(simulated(InnovertIBD(1)))
     bus.attach(InvtCHE(1))
 
-    def refuse(request: Message) -> bytes | None:
-        is_look = request.start == InvtCHE.device.address
-        refusal = Message(1, request.function, request.start, exception=2)
-        return build_reply(Framing.RTU, refusal) if is_look else None
-
-    bus.answers = refuse
+    bus.refuses = lambda request: 2 if request.start == InvtCHE.device.address else 0
     (stopped,) = bus.bus.stop_all(seconds=1).values()
     assert stopped.seen is not Seen.FAILED
     assert bus.written[0].startswith("01 06 10 00 00 05")
@@ -370,14 +365,7 @@ def test_a_stop_is_sent_after_an_exception_to_the_identity_check(model: str, cod
     line, drive, sim = one(MAKE[model](1))
     sim.motor.energised = True
 
-    def refuse(request: Message) -> bytes | None:
-        if is_write(request) or writes(line):
-            return None
-        return build_reply(
-            drive.framing, Message(1, request.function, request.start, exception=code, data=bytes(4))
-        )
-
-    line.answers = refuse
+    line.refuses = lambda request: 0 if is_write(request) or writes(line) else code
     begun = line.seconds
     drive.stop()
     stop = first(line, 0, STOPS[model])
@@ -516,13 +504,8 @@ def test_a_drive_that_refuses_the_identity_check_is_sent_its_stop(model: str) ->
     """Reads with function 04 are answered: only the ERMAN's identity check uses them."""
     line, drive, _ = one(MAKE[model](1))
 
-    def refuse(request: Message) -> bytes | None:
-        if is_write(request) or request.function == 4:
-            return None
-        return build_reply(drive.framing, Message(1, request.function, request.start, exception=2))
-
     if drive.framing is Framing.RTU:
-        line.answers = refuse
+        line.refuses = lambda request: 0 if is_write(request) or request.function == 4 else 2
     with suppress(BusError):
         drive.stop(seconds=1)
     assert STOPS[model](writes(line)[0])

@@ -151,12 +151,7 @@ def test_an_interrupted_stop_also_ends_a_jog() -> None:
     drive.jog()
     begun = len(writes(line))
 
-    def press(request: Message) -> bytes | None:
-        if len(writes(line)) == begun + 1:
-            raise KeyboardInterrupt
-        return None
-
-    line.answers = press
+    line.fails = lambda request: KeyboardInterrupt() if len(writes(line)) == begun + 1 else None
     with pytest.raises(KeyboardInterrupt):
         drive.stop()
     sent = writes(line)[begun:]
@@ -188,12 +183,7 @@ def test_an_interrupted_stop_is_sent_again_with_its_reads_but_without_its_waits(
     line.bus.check_identity(drive)
     begun, pressed = len(line.frames), [KeyboardInterrupt()]
 
-    def press(request: Message) -> bytes | None:
-        if pressed:
-            raise pressed.pop()
-        return None
-
-    line.answers = press
+    line.fails = lambda request: pressed.pop() if pressed else None
     with pytest.raises(KeyboardInterrupt) as interruption:
         drive.stop()
     assert [write.data for write in writes(line, begun)] == [b"\0\7"]
@@ -206,10 +196,7 @@ def test_a_second_interruption_ends_the_repetition_of_a_stop() -> None:
     line, drive, _ = one(InvtCHE(1, maximum_frequency=50))
     line.bus.check_identity(drive)
 
-    def press(request: Message) -> bytes | None:
-        raise KeyboardInterrupt
-
-    line.answers = press
+    line.fails = lambda request: KeyboardInterrupt()
     with pytest.raises(KeyboardInterrupt) as interruption:
         drive.stop()
     assert len(writes(line)) == 2

@@ -78,16 +78,13 @@ def test_stop_on_exit_stops_detached_drives(pair: RunningPair, caplog: pytest.Lo
             act()
     assert [record for record in caplog.records if record.levelno >= logging.WARNING] == []
 
-    def lose(request: Message) -> bytes | None:
-        raise PortLost("hall", "there is no such port")
-
-    pair.line.answers = lose
+    pair.line.fails = lambda request: PortLost("hall", "there is no such port")
     pair.bus.part_with([second], [second])
     flush(60)
     told = [record.getMessage() for record in caplog.records if record.name == "multidrop.bus"]
     assert len(told) == 1
     assert told[0].startswith("invt-che@2: failed after 30")  # no stop was sent to this drive
-    pair.line.answers = lambda request: None
+    pair.line.fails = lambda request: None
 
 
 def test_a_drive_being_detached_cannot_be_started_after_its_stop(pair: RunningPair) -> None:

@@ -5,16 +5,15 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 from examples import usually
-from motors import MAKE, STARTS
+from motors import MAKE
 from profile_families import MAKE as PROFILES
 from simulated_bus import SimulatedBus, is_write, one
-from stop_frames import Meanwhile, first, writes
+from stop_frames import Meanwhile, starts, writes
 from tables import table
 
 from multidrop import DelixiNative, InnovertIBD
@@ -23,7 +22,7 @@ from multidrop.control.call import written_before
 from multidrop.control.outcome import Effect, Seen, Stopped
 from multidrop.control.ramp import ramp
 from multidrop.control.records import read_audit, written_by
-from multidrop.core import Message, build_reply
+from multidrop.core import Message
 from multidrop.drive import Direction, Drive, Script, State, read, write
 from multidrop.drive.register import Kept, reading, setting
 from multidrop.drive.state import KnownSetpoint
@@ -291,16 +290,14 @@ def test_the_text_of_a_stops_result_includes_the_reason() -> None:
     assert str(Stopped("fan", Seen.SENT, 30.0, "no reply")) == "fan: sent but unknown after 30.0 s: no reply"
 
 
+LOST = LineError("hall", "the port was lost (hung up)")
+
+
 def test_a_port_lost_after_a_confirmed_start_raises_unconfirmed() -> None:
     line, drive, _ = one(InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(20)
 
-    def lost(request: Message) -> bytes | None:
-        if first(line, 0, STARTS["invt-che"]) is not None and not is_write(request):
-            raise LineError("hall", "the port was lost (hung up)")
-        return None
-
-    line.answers = lost
+    line.fails = lambda request: LOST if starts(line, "invt-che") and not is_write(request) else None
     with pytest.raises(Unconfirmed, match=r"control = FORWARD took effect: it was confirmed, but .*lost"):
         drive.start()
 
@@ -309,12 +306,7 @@ def test_a_port_lost_during_read_back_makes_the_write_unconfirmed() -> None:
     line, drive, _ = one(InvtCHE(1, maximum_frequency=50))
     line.bus.check_identity(drive)
 
-    def lost(request: Message) -> bytes | None:
-        if writes(line) and not is_write(request):
-            raise LineError("hall", "the port was lost (hung up)")
-        return None
-
-    line.answers = lost
+    line.fails = lambda request: LOST if writes(line) and not is_write(request) else None
     outcome = drive.try_write(drive.setpoint, 10.0)
     assert outcome.effect is Effect.UNCONFIRMED
     with pytest.raises(Unconfirmed, match="confirmed, but not read back"):
@@ -369,19 +361,13 @@ def test_an_unsent_setpoint_does_not_change_the_known_setpoint(make: Make) -> No
     assert drive.commanded == known
 
 
-def refused(request: Message) -> bytes | None:
-    if not is_write(request):
-        return None
-    return bytes(build_reply(InnovertIBD(1).framing, replace(request, exception=4)))
-
-
 def test_a_setpoint_that_the_drive_refuses_does_not_change_the_known_setpoint() -> None:
     bus, drive = told(lambda: InnovertIBD(1, maximum_frequency=50))
     known = drive.commanded
-    bus.answers = refused
+    bus.refuses = lambda request: 4 if is_write(request) else 0
     with pytest.raises(DriveException):
         drive.set_frequency(30)
-    bus.answers = lambda request: None
+    bus.refuses = lambda request: 0
     assert drive.commanded == known
     drive.start()
 

@@ -18,7 +18,7 @@ from multidrop.bus import Bus
 from multidrop.control import records
 from multidrop.control.eeprom_ledger import Ledger
 from multidrop.control.outcome import Effect
-from multidrop.core import Completion, Exchange, Failure, Framing, Message, build_reply
+from multidrop.core import Completion, Exchange, Failure, Message
 from multidrop.drive import Condition, Direction, Drive, Script, read, wait, write
 from multidrop.drive.register import COIL, Kept, reading, setting
 from multidrop.drive.verbs import verb
@@ -205,8 +205,7 @@ def test_only_stops_are_sent_while_a_late_reply_is_due(monkeypatch: pytest.Monke
 def test_a_modbus_exception_is_reported_with_its_meaning_for_the_family() -> None:
     line, drive, _ = one(InvtCHE(1))
     line.bus.check_identity(drive)
-    refusal = build_reply(Framing.RTU, Message(1, 6, exception=0x12))
-    line.answers = lambda request: refusal if request.function == 6 else None
+    line.refuses = lambda request: 0x12 if request.function == 6 else 0
     outcome = drive.try_write(drive.setpoint, 50.0)
     assert outcome.effect is Effect.REFUSED
     with pytest.raises(DriveException, match="code 12H, write not allowed: out of range"):
@@ -216,8 +215,7 @@ def test_a_modbus_exception_is_reported_with_its_meaning_for_the_family() -> Non
 
 def test_a_watchdog_that_cannot_be_read_is_described_by_the_family() -> None:
     line, drive, _ = one(YD1000(1))
-    refusal = build_reply(Framing.RTU, Message(1, 3, exception=2))
-    line.answers = lambda request: refusal if request.function == 3 else None
+    line.refuses = lambda request: 2 if request.function == 3 else 0
     assert line.bus.watchdog(drive) == drive.watchdog
 
 
@@ -274,8 +272,7 @@ def test_an_exception_to_a_read_after_a_start_raises_unconfirmed() -> None:
     """Raising DriveException would mean that the drive refused the start."""
     line, drive, sim = one(InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(20)
-    busy = build_reply(Framing.RTU, Message(1, 3, exception=6))
-    line.answers = lambda request: busy if starts(line, "invt-che") and not is_write(request) else None
+    line.refuses = lambda request: 6 if starts(line, "invt-che") and not is_write(request) else 0
     with pytest.raises(Unconfirmed, match=r"control = FORWARD took effect: it was confirmed, but .*code 06H"):
         drive.start()
     assert len(starts(line, "invt-che")) == 1

@@ -20,7 +20,7 @@ from multidrop.control.eeprom_ledger import Ledger
 from multidrop.control.outcome import Seen
 from multidrop.control.ramp import ramp, start_staggered
 from multidrop.control.stops import AT_ONCE, LEAST_S, PAUSE_S
-from multidrop.core import Completion, Exchange, Message, build_reply
+from multidrop.core import Completion, Exchange, Message
 from multidrop.drive import Condition, Drive, Script, read, wait, write
 from multidrop.drive.verbs import verb
 from multidrop.errors import CancelledByStop, DriveException, LineError, PortLost, Unconfirmed
@@ -382,10 +382,7 @@ def test_a_stop_reopens_a_lost_port_unless_a_poller_does(tended: bool) -> None:
 def test_a_stop_on_a_closed_port_raises_immediately() -> None:
     line, drive, _ = one(InvtCHE(1, maximum_frequency=50))
 
-    def closed(request: Message) -> bytes | None:
-        raise LineError("hall", "it is closed")
-
-    line.answers = closed
+    line.fails = lambda request: LineError("hall", "it is closed")
     begun = line.seconds
     with pytest.raises(LineError, match="it is closed"):
         drive.stop()
@@ -593,15 +590,11 @@ def test_a_refused_stop_is_not_reported_as_unsent() -> None:
     line, drive, _ = one(InnovertIBD(1))
     told: list[str] = []
 
-    def refuse(request: Message) -> bytes | None:
+    def refuse(request: Message) -> int:
         told.extend(line.bus.stops_under_way().values())
-        if not is_write(request):
-            return None
-        return build_reply(
-            drive.framing, Message(request.address, request.function, request.start, exception=1)
-        )
+        return 1 if is_write(request) else 0
 
-    line.answers = refuse
+    line.refuses = refuse
     found = line.bus.stop_all(seconds=2)[drive.name]
     assert found.seen is Seen.REFUSED
     assert str(found).startswith(f"{drive.name}: refused by the drive after 2.")

@@ -403,8 +403,7 @@ def test_erman_diagnostics_and_unknown_addresses_are_not_used_erratum_e13_e16() 
 
 def test_request_refused_as_damaged_by_a_che_is_repeated_erratum_i4() -> None:
     line, drive, _ = one(InvtCHE(1))
-    damaged = build_reply(Framing.RTU, Message(1, 3, exception=0x11))
-    line.answers = lambda request: damaged if len(line.frames) == 1 else None
+    line.refuses = lambda request: 0x11 if len(line.frames) == 1 else 0
     assert drive.read(drive.output_frequency) == 0
     assert len(line.frames) == 2
 
@@ -412,8 +411,7 @@ def test_request_refused_as_damaged_by_a_che_is_repeated_erratum_i4() -> None:
 def test_erman_identify_refuses_the_models_03_and_04_erratum_i2_e() -> None:
     """These models lack function 04; the exception makes `identify` refuse them."""
     line, drive, _ = one(ErmanERG220(1))
-    refusal = build_reply(Framing.RTU, Message(1, 4, exception=1))
-    line.answers = lambda request: refusal if request.function == 4 else None
+    line.refuses = lambda request: 1 if request.function == 4 else 0
     with pytest.raises(WriteForbidden, match="not an ER-G-220"):
         drive.set_frequency(20)
     assert line.written == []
@@ -487,8 +485,7 @@ def test_delixi_fault_04_is_decoded_as_ou_erratum_d8() -> None:
 def test_any_exception_code_is_a_refusal_erratum_d13_y15(code: int) -> None:
     for make in (delixi, yd):
         line, drive, _ = one(make())
-        refusal = build_reply(Framing.RTU, Message(1, 3, exception=code))
-        line.answers = lambda request, refusal=refusal: refusal
+        line.refuses = lambda request: code
         with pytest.raises(DriveException) as raised:
             drive.read(drive.output_frequency)
         assert raised.value.code == code

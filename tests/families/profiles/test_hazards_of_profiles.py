@@ -278,13 +278,12 @@ def test_stop_jog_is_sent_after_an_unconfirmed_stop(is_refused: bool) -> None:
     line.drive.jog()
     assert line.sim.motor.goal
 
-    def refuse(request: Message) -> bytes | None:
-        if not is_write(request) or request.data[-1] != InvtControl.STOP or not line.sim.motor.goal:
-            return None
-        return build_reply(Framing.RTU, Message(1, request.function, request.start, exception=4))
+    def refuse(request: Message) -> int:
+        is_stop = is_write(request) and request.data[-1] == InvtControl.STOP
+        return 4 if is_stop and line.sim.motor.goal else 0
 
     if is_refused:
-        line.bus.answers = refuse
+        line.bus.refuses = refuse
         line.drive.stop()
     else:
         line.bus.loses = lambda request: True

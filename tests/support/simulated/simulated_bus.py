@@ -65,6 +65,10 @@ class SimulatedBus:
         self.deafens: Callable[[Message], bool] = lambda request: False
         # returns a reply that replaces the drives' reply, or None
         self.answers: Callable[[Message], bytes | None] = lambda request: None
+        # returns an error that ends the exchange, or None
+        self.fails: Callable[[Message], BaseException | None] = lambda request: None
+        # returns the code of an exception with which the drive refuses the request, or 0
+        self.refuses: Callable[[Message], int] = lambda request: 0
         self.queue_time = 0.0  # s that each exchange waits for its turn
         self.queue = object()  # as long as this is not None, the port counts as open
         self.has_echo = False
@@ -122,7 +126,12 @@ class SimulatedBus:
         frame = build_request(exchange.framing, request)
         self.frames.append((request, text(frame)))
         self.seconds += EXCHANGE_TIME
+        if failure := self.fails(request):
+            raise failure
         reply = self.answers(request)
+        if code := self.refuses(request):
+            refusal = Message(request.address, request.function, request.start, exception=code)
+            reply = build_reply(exchange.framing, refusal)
         if reply is None and not self.deafens(request):
             answers = [
                 sim.answer(request, self.seconds)
