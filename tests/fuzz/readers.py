@@ -20,12 +20,14 @@ from multidrop.drive.line_settings import SERIAL_ADDRESSES
 from multidrop.drive.register import Access
 from multidrop.families.files import FamilyError
 from multidrop.families.files.loader import load_family
+from multidrop.history.growing import GrowingSegment
 from multidrop.importers import SUFFIXES, ImportedDevice, family_text, plant_text, read_devices
 from multidrop.planning.blocks import blocks
 from multidrop.plant.loader import PlantError, load_plant
 from multidrop.plant.model import Plant
 from multidrop.polling.batch import Row, Rows
 from multidrop.recording import Metadata, open_recording, open_writer, repair
+from multidrop.recording.rows import from_rows
 from multidrop.samples.message import MOST_ROWS, ROWS, MessageError, unpack
 from multidrop.sim.faults import load_faults
 
@@ -138,6 +140,25 @@ def read_recording(path: Path) -> None:
             assert (repaired.truncated, _comparable(repaired)) == (0, rows)
 
 
+def read_segment(path: Path) -> None:
+    """Read an .arrows file, also as a segment of a history, which must have the same rows."""
+    read_recording(path)
+    batches: list[Rows] = []
+    found: list[Row] = []
+    with suppress(ValueError):
+        segment = GrowingSegment(path)
+        segment.read_new()
+        for batch in segment.batches(*ALWAYS):
+            found += segment.rows_of(batch, None, *ALWAYS)
+        segment.let_go()
+    with suppress(ValueError):
+        batches.extend(open_recording(path))
+    assert _comparable([from_rows(found)] if found else []) == _comparable(batches)
+
+
+ALWAYS = -(1 << 64), 1 << 64  # ns; before and after the time of every row
+
+
 @cache
 def known_plant(folder: Path) -> Plant:
     (folder / "known.toml").write_text(PLANT)
@@ -214,7 +235,7 @@ READERS: dict[str, tuple[str, Callable[[Path], None]]] = {  # reader: suffix of 
     "family": (".toml", read_family),
     "import": (".txt", read_import),
     "faults": (".toml", read_faults),
-    "arrows": (".arrows", read_recording),
+    "arrows": (".arrows", read_segment),
     "csv": (".csv", read_recording),
     "parquet": (".parquet", read_recording),
     "pcap": (".pcapng", read_capture),

@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 from examples import examples, usually
 from histories import DAY, METADATA, NOON, SECOND, check_buckets, random_rows, record, rows_in
+from recordings import record_as_before
 
 from multidrop import History
 from multidrop.history import growing
@@ -23,6 +24,7 @@ from multidrop.history.database import Database
 from multidrop.history.sources import Replaced, Sources
 from multidrop.polling.batch import Row
 from multidrop.recording import open_recording
+from multidrop.recording.arrow_decoder import MOST_CODES
 from multidrop.recording.rows import from_rows
 from multidrop.recording.segments import SegmentWriter
 
@@ -390,3 +392,30 @@ def test_a_reader_copes_with_replaced_files(tmp_path: Path, monkeypatch: pytest.
     with History(tmp_path) as history:
         assert sum(map(len, history.read(None))) == 100
     assert next(replaced, None) is None
+
+
+def test_segments_of_version_0_1_are_read(tmp_path: Path, rows: list[list[Row]]) -> None:
+    """In this format, names have no codes. The value of one row has no uncertainty."""
+    first = [rows[0][0]._replace(uncertainty_ns=None), *rows[0][1:]]
+    record_as_before(tmp_path / "run.00000001.arrows", from_rows(first))
+    with SegmentWriter(tmp_path / "run.arrows", METADATA, every=60.0) as writer:
+        writer.write(from_rows(rows[1]))
+    wanted = [*first, *rows[1]]
+    begin, end = first[0].time_ns, max(row.time_ns for row in wanted) + 1
+    with History(tmp_path / "run.arrows") as history:
+        assert rows_in(history) == wanted
+        assert rows_in(history, ["pump-1.speed"], begin, end) == [
+            row for row in wanted if (row.drive, row.register) == ("pump-1", "speed")
+        ]
+        for points in (5, 800):
+            for series, buckets in history.buckets(SERIES, begin, end, points).items():
+                check_buckets(buckets, wanted, series)
+        assert history.damage == []
+
+
+def test_a_segment_of_version_0_1_with_too_many_names_is_damaged(tmp_path: Path) -> None:
+    rows = [Row(at, at, None, "pump", f"r{at}", None, "no reply") for at in range(MOST_CODES + 1)]
+    record_as_before(tmp_path / "run.00000001.arrows", from_rows(rows))
+    with History(tmp_path / "run.arrows") as history:
+        assert rows_in(history) == []
+        assert "65537 names; the limit is 65536" in history.damage[0]

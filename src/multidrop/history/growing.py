@@ -139,7 +139,7 @@ class GrowingSegment:
         columns = self._tail.again(self._batches[number].place)
         for at in _places(columns, _codes(columns.drives, columns.registers, series)):
             name = columns.drives[columns.drive[at]], columns.registers[columns.register[at]]
-            yield SeriesRow(name, columns.time[at], columns.value[at] if _is_valid(columns, at) else None)
+            yield SeriesRow(name, columns.time[at], columns.value[at] if _is_set(columns.valid, at) else None)
 
     def _gather_tens(self, found: Mapping[Series, Accumulator], grid: Grid) -> None:
         if len(self._tens) > MOST_TENS:
@@ -162,8 +162,8 @@ class GrowingSegment:
             tens.past = end
 
 
-def _is_valid(columns: RecordedColumns, at: int) -> bool:
-    return columns.valid is None or bool(columns.valid[at >> 3] >> (at & 7) & 1)
+def _is_set(bits: bytes | None, at: int) -> bool:
+    return bits is None or bool(bits[at >> 3] >> (at & 7) & 1)
 
 
 @lru_cache(maxsize=64)
@@ -194,14 +194,13 @@ def _rows(
     for at in _places(columns, wanted):
         time = columns.time[at]
         if begin <= time < end:
-            is_valid = _is_valid(columns, at)
             yield Row(
                 time,
                 columns.monotonic_ns[at],
-                columns.uncertainty_ns[at] if is_valid else None,
+                columns.uncertainty_ns[at] if _is_set(columns.certain, at) else None,
                 columns.drives[columns.drive[at]],
                 columns.registers[columns.register[at]],
-                columns.value[at] if is_valid else None,
+                columns.value[at] if _is_set(columns.valid, at) else None,
                 columns.statuses[columns.status[at]],
             )
 

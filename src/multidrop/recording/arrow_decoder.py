@@ -7,6 +7,7 @@ those of Arrow's format/Message.fbs and format/Schema.fbs.
 from __future__ import annotations
 
 import struct
+from array import array
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice, pairwise
@@ -125,6 +126,7 @@ def _message(file: BinaryIO, at: int, size: int) -> IpcMessage | None:
 
 # limit in bytes of one column's texts in one batch: a small damaged file could expand to gigabytes
 MOST_SPELLED = 1 << 28
+MOST_CODES = 1 << 16  # limit of the different names in a batch
 Buffers = tuple[Any, ...]
 
 
@@ -133,12 +135,14 @@ class RecordedColumns(NamedTuple):
 
     time: memoryview
     monotonic_ns: memoryview
-    uncertainty_ns: memoryview  # 0 if the row has no value
+    uncertainty_ns: memoryview  # undefined if the row has no uncertainty
     drive: memoryview
     register: memoryview
     value: memoryview  # undefined if the row has no value
     status: memoryview
-    valid: bytes | None  # one bit per row: 1 if the row has a value; None: every row has a value
+    # one bit per row: 1 if the row has an uncertainty, or a value; None: every row has one
+    certain: bytes | None
+    valid: bytes | None
     drives: tuple[str, ...]
     registers: tuple[str, ...]
     statuses: tuple[str, ...]
@@ -181,35 +185,41 @@ class BatchDecoder:
     def columns(self, header: FlatTable, body: memoryview, names_of: dict[int, Names]) -> RecordedColumns:
         """Return a batch's columns, with codes in place of names.
 
-        `names_of` are the dictionaries that precede this batch in the file. Raises the errors of `decode`,
-        and ValueError for files of earlier versions, whose names have no codes.
+        `names_of` are the dictionaries that precede this batch in the file. Raises the errors of `decode`.
         """
         rows, buffers = _parts(header, body, sum(column.buffers for column, _ in self._columns))
         left = iter(buffers)
         found: list[Any] = []
         names: list[tuple[str, ...]] = []
-        valid: bytes | None = None
+        filled: list[bytes | None] = []  # bitmaps of the columns that may have nulls
         for column, identity in self._columns:
-            bits, data, *_ = islice(left, column.buffers)
-            if len(bits) and not column.nullable:
+            bits, data, *text = islice(left, column.buffers)
+            if column.nullable:
+                filled.append(bits or None)
+            elif len(bits):
                 _check_filled(column, bits, rows)
-            if column.name == b"value":
-                valid = bits or None
             if identity is not None:
                 codes, known = wide_codes(data, rows, column.code_bits // 8), names_of.get(identity)
                 if known is None or (rows and greatest_code(codes) >= len(known)):
                     raise ValueError("a batch of rows precedes the dictionary that its codes need")
                 found.append(codes)
                 names.append(known.listed)
+            elif column.kind == UTF8:  # a file of version 0.1, in which names have no codes
+                numbers: dict[str, int] = {}
+                texts = [numbers.setdefault(name, len(numbers)) for name in _texts(data, text[0], rows)]
+                if len(numbers) > MOST_CODES:
+                    raise ValueError(f"a batch has {len(numbers)} names; the limit is {MOST_CODES}")
+                found.append(memoryview(array("H", texts)))
+                names.append(tuple(numbers))
             elif column.detail == SINGLE:
                 found.append(widen(data, bits or None, rows).cast("B").cast("q"))
-            elif column.kind == UTF8 or len(data) < 8 * rows:
+            elif len(data) < 8 * rows:
                 raise ValueError("the stated lengths do not match the data")
             else:
                 found.append(memoryview(data[: 8 * rows]).cast("d" if column.kind == FLOAT else "q"))
-        if valid is not None and len(valid) * 8 < rows:
+        if any(bits is not None and len(bits) * 8 < rows for bits in filled):
             raise ValueError("the stated lengths do not match the data")
-        return RecordedColumns._make([*found, valid, *names])
+        return RecordedColumns._make([*found, *filled, *names])
 
     def _decoded(
         self, column: FileColumn, identity: int | None, rows: int, bits: bytes, *data: Any
@@ -237,15 +247,7 @@ class BatchDecoder:
         if table is None or number not in self._ids:
             raise ValueError("it has a dictionary that no column uses")
         count, (_, ends, text) = _parts(table, body, 3)
-        _check_text(ends, text)
-        if count and len(ends) < 4 * (count + 1):
-            raise ValueError("the stated lengths do not match the data")
-        places = memoryview(ends)[: 4 * (count + 1)].cast("i") if count else [0]
-        names = []
-        for begin, end in pairwise(places):
-            if not 0 <= begin <= end <= len(text):
-                raise ValueError("the stated lengths do not match the data")
-            names.append(str(text[begin:end], "utf-8"))
+        names = _texts(ends, text, count)
         before = self._names.get(number) if header.number(2, "<?") else None
         learnt = Names([*(before.listed if before else ()), *names])
         self._names = {**self._names, number: learnt}
@@ -262,6 +264,20 @@ def _parts(batch: FlatTable, body: memoryview, count: int) -> tuple[int, list[by
         raise ValueError(f"a batch has {len(places)} buffers, not {count}")
     # copies, because a view of `body` that survives in an error's traceback would crash the interpreter
     return rows, [bytes(body[at : at + length]) for at, length in places]
+
+
+def _texts(ends: bytes, text: bytes, count: int) -> list[str]:
+    """Return the texts of a column with `count` rows. Raises ValueError if they are damaged."""
+    _check_text(ends, text)
+    if count and len(ends) < 4 * (count + 1):
+        raise ValueError("the stated lengths do not match the data")
+    places = memoryview(ends)[: 4 * (count + 1)].cast("i") if count else [0]
+    texts = []
+    for begin, end in pairwise(places):
+        if not 0 <= begin <= end <= len(text):
+            raise ValueError("the stated lengths do not match the data")
+        texts.append(str(text[begin:end], "utf-8"))
+    return texts
 
 
 def _check_filled(column: FileColumn, bits: bytes, rows: int) -> None:

@@ -176,7 +176,8 @@ class ArrowsTail:
     def new(self) -> Iterator[RecordedBatch]:
         """Yield the batches appended since the last call. Raises ValueError if the file is damaged."""
         for message in messages(self._file, self._size(), self._end):
-            if not message.header:
+            if not message.header:  # the end marker of a stream that another program wrote
+                self._end = message.end
                 return
             body = self._body(message)
             try:
