@@ -45,10 +45,7 @@ def port(toy: SimulatedDrive) -> Iterator[str]:
 
 @pytest.fixture
 def plant(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """Yield a plant file with two drives. Only the first is simulated, on a line with real timing.
-
-    Each reply arrives in one piece.
-    """
+    """Yield a plant file with two drives. Only the first is simulated, on a line with real timing."""
     monkeypatch.setattr(wire, "CHUNK", 1.0)
     port = tmp_path / "ports" / "hall-1"
     port.parent.mkdir()

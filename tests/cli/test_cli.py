@@ -144,7 +144,7 @@ def test_the_help_imports_no_command_and_no_large_library() -> None:
         ),
     ],
 )
-def test_a_mistaken_command_is_one_sentence_with_status_2(run: Run, words: list[str], sentence: str) -> None:
+def test_mistaken_commands_print_a_sentence_and_return_2(run: Run, words: list[str], sentence: str) -> None:
     assert run(*words) == (2, "", f"multidrop: {sentence}\n")
 
 
@@ -195,25 +195,20 @@ def test_a_reports_file_name_must_end_in_html(run: Run, tmp_path: Path) -> None:
     assert (status, err) == (2, f"multidrop: {tmp_path / 'a.txt'}: a report's name must end in .html\n")
 
 
-def test_a_line_with_a_slash_in_its_name_is_not_simulated(run: Run, tmp_path: Path) -> None:
-    plant = tmp_path / "plant.toml"
-    plant.write_text(
-        '[[line]]\nname = "hall/1"\nport = "x"\n[[line.drive]]\nname = "a"\naddress = 1\nmodel = "yd1000"\n'
-    )
-    status, _, err = run("simulate", plant, "--ports", tmp_path / "ports")
-    assert (status, err) == (2, "multidrop: line 'hall/1' has a / in its name: rename it to link its port\n")
-
-
-def test_a_file_in_place_of_the_directory_of_ports_is_refused(run: Run, tmp_path: Path) -> None:
-    plant = tmp_path / "plant.toml"
-    plant.write_text(
-        '[[line]]\nname = "a"\nport = "x"\n[[line.drive]]\nname = "a"\naddress = 1\nmodel = "yd1000"\n'
-    )
-    assert run("simulate", plant, "--ports", plant) == (
-        2,
-        "",
-        f"multidrop: --ports {plant} is a file: name a directory; it is created if missing\n",
-    )
+@table(
+    ("name", "ports", "sentence"),
+    [
+        ("hall/1", "ports", "line 'hall/1' has a / in its name: rename it to link its port"),
+        ("a", "plant.toml", "--ports plant.toml is a file: name a directory; it is created if missing"),
+    ],
+)
+def test_ports_that_cannot_be_linked_are_refused(
+    run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str, ports: str, sentence: str
+) -> None:
+    drive = '[[line.drive]]\nname = "a"\naddress = 1\nmodel = "yd1000"\n'
+    monkeypatch.chdir(tmp_path)
+    Path("plant.toml").write_text(f'[[line]]\nname = "{name}"\nport = "x"\n{drive}')
+    assert run("simulate", "plant.toml", "--ports", ports) == (2, "", f"multidrop: {sentence}\n")
 
 
 def test_a_missing_ledger_file_is_reported(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -254,7 +249,7 @@ def test_a_missing_ledger_file_is_reported(run: Run, tmp_path: Path, monkeypatch
         ),
     ],
 )
-def test_a_forbidden_write_is_one_sentence_with_status_1(run: Run, words: list[str], sentence: str) -> None:
+def test_forbidden_writes_print_a_sentence_and_return_1(run: Run, words: list[str], sentence: str) -> None:
     assert run(*words) == (1, "", f"multidrop: {sentence}\n")
 
 
@@ -323,11 +318,8 @@ def test_each_kind_of_advice_in_errors_has_a_command_that_replaces_it() -> None:
         ("/dev/null", "/dev/null: it is not a serial port"),
     ],
 )
-def test_a_port_that_cannot_be_opened_is_one_sentence_with_status(run: Run, port: str, sentence: str) -> None:
+def test_unusable_ports_print_a_sentence_and_return_1(run: Run, port: str, sentence: str) -> None:
     assert run("read", port, TOY, 1) == (1, "", f"multidrop: {sentence}\n")
-
-
-# ---- signals ----
 
 
 def test_a_command_can_run_in_a_thread_and_keeps_signal_handlers(capsys: pytest.CaptureFixture[str]) -> None:
@@ -340,9 +332,6 @@ def test_a_command_can_run_in_a_thread_and_keeps_signal_handlers(capsys: pytest.
     assert found == [0]
     assert "TOY T1" in capsys.readouterr().out
     assert signal.getsignal(signal.SIGTERM) is before
-
-
-# ---- output that cannot be written ----
 
 
 PRINTING = [["models", "yd1000"], ["--help"], ["--version"], []]

@@ -16,6 +16,7 @@ import pytest
 from commands import TOY, Run
 from kills import BoundProcess
 from lines import Faulty, patient
+from tables import table
 from toy import Status, Toy
 
 import multidrop.cli
@@ -89,22 +90,21 @@ def test_read_prints_values_as_json(run: Run, port: str) -> None:
     }
 
 
-def test_a_value_without_a_name_is_shown_as_a_number(run: Run, port: str, toy: SimulatedDrive) -> None:
-    for cell in toy.memory.of(Toy.fault):
-        cell.raw = 99
-    assert run("read", port, TOY, 1, "fault")[1] == "fault  99  (no name in the manual)\n"
-    assert json.loads(run("read", port, TOY, 1, "fault", "--json")[1])["values"] == {
-        "fault": {"value": None, "raw": 99}
-    }
-
-
-def test_a_bit_without_a_name_is_shown_by_its_number(run: Run, port: str, toy: SimulatedDrive) -> None:
-    for cell in toy.memory.of(Toy.status):
-        cell.raw = 0x1101
-    assert run("read", port, TOY, 1, "status")[1] == "status  RUNNING, bit 8, bit 12\n"
-    assert json.loads(run("read", port, TOY, 1, "status", "--json")[1])["values"] == {
-        "status": {"value": ["RUNNING", "bit 8", "bit 12"], "raw": 0x1101}
-    }
+@table(
+    ("name", "raw", "shown", "value"),
+    [
+        ("fault", 99, "99  (no name in the manual)", None),
+        ("status", 0x1101, "RUNNING, bit 8, bit 12", ["RUNNING", "bit 8", "bit 12"]),
+    ],
+)
+def test_values_and_bits_without_names_are_shown_as_numbers(
+    run: Run, port: str, toy: SimulatedDrive, name: str, raw: int, shown: str, value: list[str] | None
+) -> None:
+    for cell in toy.memory.of(Toy.registers[name]):
+        cell.raw = raw
+    assert run("read", port, TOY, 1, name)[1] == f"{name}  {shown}\n"
+    told = json.loads(run("read", port, TOY, 1, name, "--json")[1])
+    assert told["values"] == {name: {"value": value, "raw": raw}}
 
 
 def test_read_prints_the_other_registers_if_the_drive_refuses_one(run: Run, port: str) -> None:

@@ -66,9 +66,6 @@ def one_line(directory: Path, port: str, name: str = "one.toml") -> Path:
     return path
 
 
-# ---- reading and writing ----
-
-
 def test_read_accepts_a_plant_file_and_a_drive_name(run: Run, port: str, tmp_path: Path) -> None:
     plant = one_line(tmp_path, port)
     shown = "output_current    3.25  A\noutput_frequency  49.9  Hz\n"
@@ -150,9 +147,6 @@ def test_write_accepts_plant_file_and_drive_name(run: Run, plant: Path, at: str,
     assert toy["frequency"] == 25
 
 
-# ---- commands to motors ----
-
-
 def test_verbs_accept_plant_file_and_drive_name(run: Run, plant: Path, at: str, toy: SimulatedDrive) -> None:
     drive = (plant, "pump-1", at)
     assert run("state", *drive)[1].startswith("stopped\n")
@@ -186,7 +180,7 @@ def test_only_stops_accept_other_spellings(run: Run, tmp_path: Path, port: str, 
     assert run("read", *fan, "output_current")[0] == 0
 
 
-def test_a_start_by_plant_file_is_confirmed(run: Run, plant: Path, at: str, toy: SimulatedDrive) -> None:
+def test_a_start_by_plant_file_needs_confirming(run: Run, plant: Path, at: str, toy: SimulatedDrive) -> None:
     status, _, err = run("start", plant, "pump-1", at)
     assert (status, err.startswith("multidrop: Start the motor of pump-1 on /dev/pts/")) == (1, True)
     assert not toy.counters.writes
@@ -225,9 +219,6 @@ def test_an_interrupted_start_prints_the_stop_command_with_the_plant_file(
     assert status == 130
     assert err.splitlines()[-1] == f"multidrop: to stop it, type: multidrop stop {plant} pump-1 {at}"
     assert run(*err.splitlines()[-1].split()[6:])[0] == 0
-
-
-# ---- commands for whole lines ----
 
 
 def test_models_shows_the_family_of_a_drive_in_a_plant(run: Run, plant: Path) -> None:
@@ -357,9 +348,6 @@ def test_a_family_file_in_place_of_a_plant_file_is_refused(run: Run, tmp_path: P
     status, out, err = run("read", tmp_path / "meter.toml", "meter-1")
     assert (status, out) == (2, "")
     assert "'line' is missing; add [[line]]" in err
-
-
-# ---- stops of a whole plant ----
 
 
 @pytest.mark.parametrize("words", [[], ["--all"], ["--line", "hall-1"]])

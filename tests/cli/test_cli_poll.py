@@ -34,6 +34,7 @@ from multidrop.families import MODELS, InvtCHE
 from multidrop.recording import open_recording, open_writer
 from multidrop.sim import Simulator, Wire, simulated
 
+OUT = ("--out", "a.arrows")
 SIMULATING = """
 import sys, time
 from pathlib import Path
@@ -139,9 +140,24 @@ def test_a_recording_in_segments_must_be_named_by_a_segment(run: Run, tmp_path: 
         (["--rotate", "1 h", "--out", "a.csv"], "--rotate needs a name that ends in .arrows"),
         (["--rotate", "soon"], "invalid time 'soon': write 1 s to 100 years"),
         (["--most", "big"], "invalid size 'big': write 1 kB or more"),
+        (["--trigger", "pump-1.output_current", *OUT], "--trigger pump-1.output_current: column 1: "),
+        (
+            ["--trigger", "output_current > 30", *OUT],
+            "output_current has no drive; write it as pump-1.",
+        ),
+        (["--trigger", "key"], "--trigger needs --out"),
+        (["--trigger", "key", *OUT, "--rotate", "1 h"], "--trigger and --rotate exclude each other"),
+        (
+            ["--trigger", "key", "--out", "a.txt"],
+            "a.txt: a recording's name must end in .arrows",
+        ),
+        (["--trigger", "key", *OUT], "--trigger key needs a terminal and excludes --json"),
+        (["--pre", "1 s"], "--pre and --post belong to a trigger"),
     ],
 )
-def test_invalid_segment_options_are_named(run: Run, plant: Path, words: list[str], sentence: str) -> None:
+def test_invalid_segment_and_trigger_options_are_named(
+    run: Run, plant: Path, words: list[str], sentence: str
+) -> None:
     status, out, told = run("poll", plant, *words)
     assert (status, out) == (2, "")
     assert sentence in told
@@ -437,9 +453,6 @@ def test_a_killed_demo_leaves_no_simulator(tmp_path: Path) -> None:
     until(lambda: not (ports / "hall-1").is_symlink())
 
 
-# ---- triggers ----
-
-
 @pytest.mark.slow
 def test_poll_records_each_trigger_in_its_own_file(run: Run, plant: Path, tmp_path: Path) -> None:
     condition = "integral(pump-1.output_current >= 0) > 0.3"
@@ -470,7 +483,7 @@ def test_poll_records_a_fault_and_a_changed_value(run: Run, tmp_path: Path) -> N
             return cast("Message | None", answer(request, now))
 
         vars(fan)["answer"] = tripping
-        options = (
+        triggers = (
             "--trigger",
             "fault",
             "--trigger",
@@ -480,46 +493,15 @@ def test_poll_records_a_fault_and_a_changed_value(run: Run, tmp_path: Path) -> N
             "--post",
             "500 ms",
         )
-        _, out, _ = run(
-            "poll", tmp_path / "plant.toml", "--seconds", 5, *options, "--out", tmp_path / "trip.arrows"
-        )
+        words = ("poll", tmp_path / "plant.toml", "--seconds", 5, "--out", tmp_path / "trip.arrows")
+        _, out, _ = run(*words, *triggers)
     assert "2 triggers recorded" in out
     paths = [tmp_path / f"trip.{number:08d}.arrows" for number in (1, 2)]
-    triggers = [open_recording(path).metadata["trigger"] for path in paths]
-    assert {trigger["condition"] for trigger in triggers} == {"fault of fan", "changed(fan.fault)"}
-    for path, trigger in zip(paths, triggers, strict=True):
+    fired = [open_recording(path).metadata["trigger"] for path in paths]
+    assert {trigger["condition"] for trigger in fired} == {"fault of fan", "changed(fan.fault)"}
+    for path, trigger in zip(paths, fired, strict=True):
         faults = [(row.time_ns, row.value) for row in recorded(path) if row.register == "fault"]
         before = [time for time, value in faults if value == 0.0]
         assert before
         assert max(before) < trigger["time_ns"]
         assert min(time for time, value in faults if value == 4.0) == trigger["time_ns"]
-
-
-@pytest.mark.parametrize(
-    ("options", "sentence"),
-    [
-        (
-            ["--trigger", "pump-1.output_current", "--out", "a.arrows"],
-            "--trigger pump-1.output_current: column 1: ",
-        ),
-        (
-            ["--trigger", "output_current > 30", "--out", "a.arrows"],
-            "output_current has no drive; write it as pump-1.output_current",
-        ),
-        (["--trigger", "key"], "--trigger needs --out"),
-        (
-            ["--trigger", "key", "--out", "a.arrows", "--rotate", "1 h"],
-            "--trigger and --rotate exclude each other",
-        ),
-        (
-            ["--trigger", "key", "--out", "a.txt"],
-            "a.txt: a recording's name must end in .arrows, .csv, .parquet",
-        ),
-        (["--trigger", "key", "--out", "a.arrows"], "--trigger key needs a terminal and excludes --json"),
-        (["--pre", "1 s"], "--pre and --post belong to a trigger"),
-    ],
-)
-def test_poll_refuses_an_invalid_trigger(run: Run, plant: Path, options: list[str], sentence: str) -> None:
-    status, _, err = run("poll", plant, *options)
-    assert status == 2
-    assert sentence in err

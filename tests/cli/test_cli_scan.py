@@ -125,7 +125,7 @@ def test_scanning_a_serial_server_needs_its_baud_rate(run: Run, port: str) -> No
     assert "address 2: innovert-ibd" in out
 
 
-def test_unit_ids_beyond_a_serial_line_s_addresses_are_scanned_on_tcp(run: Run, tmp_path: Path) -> None:
+def test_unit_ids_above_the_addresses_of_serial_lines_are_scanned_on_tcp(run: Run, tmp_path: Path) -> None:
     model = tmp_path / "meter.toml"
     model.write_text(
         '[family]\ntitle = "T"\nmanual = "M"\ncounts_from = 0\naddresses = [0, 255]\n'
@@ -223,9 +223,6 @@ def test_doubts_about_a_found_drive_are_comments_in_the_plant_file(tmp_path: Pat
 def test_a_plant_file_is_not_written_without_a_drive() -> None:
     with pytest.raises(ValueError, match="so no plant file can be written"):
         plant_text("port", [Found(4, USUAL, Framing.RTU, (), 0.005)], {})
-
-
-# ---- long scans ----
 
 
 @pytest.mark.parametrize("words", [(), ("--json",)])

@@ -147,9 +147,6 @@ def test_bytes_received_late_do_not_count_as_silence(
     assert printer.pairing.counts()["unanswered"] == 0
 
 
-# ---- behind a network ----
-
-
 class ResponderLine:
     """A far end that sends the same bytes repeatedly, and stores the bytes that it receives."""
 
@@ -219,8 +216,6 @@ def test_a_lost_network_connection_ends_sniffing_with_a_sentence(run: Run) -> No
     assert (status, err.splitlines()[-1]) == (1, f"multidrop: {url}: the port was lost (hung up)")
 
 
-# ---- captures ----
-
 PAIRS = {each.frame: each for each in PRINTED if each.request is not None}
 READ = PAIRS[bytes.fromhex("01 03 02 13 88 B5 12")]
 WRITE = PAIRS[bytes.fromhex("01 06 00 02 13 88 25 5C")]
@@ -285,10 +280,7 @@ def frame(asked: bool, *message: Any, framing: Framing = Framing.RTU) -> tuple[b
 
 
 def told(run: Run, path: Path, frames: Iterable[tuple[bytes, Side]], *words: object) -> list[str]:
-    """Return the lines that `decode` prints for a capture of these frames, without times of day.
-
-    The frames are 1 ms apart.
-    """
+    """Return what `decode` prints for a capture of these frames, 1 ms apart, without times of day."""
     with CaptureWriter(path) as writer:
         for number, (raw, side) in enumerate(frames):
             writer.write(raw, side, number * 1_000_000, "hall-1")
@@ -372,9 +364,6 @@ def test_decode_prints_the_number_of_columns_and_rows(run: Run, capture: Path) -
     out = capture.parent / "a.csv"
     assert run("decode", capture, "--out", out) == (0, f"2 rows in {out}: 2 exchanges, 2 unknown bytes\n", "")
     assert [row.value for row in recorded(out)] == [5000, 5000]
-
-
-# ---- errors ----
 
 
 def test_sniff_reports_a_port_that_cannot_be_opened(run: Run, tmp_path: Path) -> None:

@@ -308,9 +308,6 @@ def test_mistaken_arguments_are_named(run: Run, words: tuple[str, ...], status: 
     assert len(err.splitlines()) == 1
 
 
-# ---- Modbus TCP and RTU over TCP ----
-
-
 @pytest.mark.long
 @pytest.mark.parametrize("port", ["tcp://127.0.0.1:0"], indirect=True)
 def test_a_drive_on_modbus_tcp_is_measured(port: str, run: Run) -> None:

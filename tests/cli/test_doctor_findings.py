@@ -73,9 +73,6 @@ def sysfs(tmp_path: Path) -> Path:
     return tmp_path
 
 
-# ---- facts of the system ----
-
-
 def test_an_adapter_is_found_through_sysfs(sysfs: Path) -> None:
     adapter = find_adapter("/dev/ttyUSB0", sysfs)
     assert (adapter.name, adapter.driver, adapter.product) == ("ttyUSB0", "ftdi_sio", "FTDI FT232R USB UART")
@@ -136,9 +133,6 @@ def test_reading_driver_features_of_a_lost_port_raises_an_error() -> None:
     for ask in (low_latency, rs485_mode):
         with pytest.raises(OSError, match="Bad file descriptor"):
             ask(slave)
-
-
-# ---- sentences ----
 
 
 @table("driver", ["cp210x", "ch341-uart", "pl2303", "cdc_acm"])
@@ -268,8 +262,6 @@ def test_a_round_trip_over_a_network_includes_the_wires_time() -> None:
     assert round_trip_finding(InvtCHE(1), [0.0140], 1, 0.0094).advice == ""
     assert "the adapter or the network" in round_trip_finding(InvtCHE(1), [0.0240], 1, 0.0094).advice
 
-
-# ---- wake-ups ----
 
 EARLY, LATE = WakeLateness(0.0001, 0.0005, 0.003), WakeLateness(0.0001, 0.004, 0.05)
 REFUSED = "the system refuses it; permit it so"

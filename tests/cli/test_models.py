@@ -1,7 +1,4 @@
-"""Families by name or from the user's files, and their sheets, which `multidrop models` prints.
-
-Every failure to find a family is a ValueError with one sentence.
-"""
+"""Families by name or from the user's files, and their sheets, which `multidrop models` prints."""
 
 from __future__ import annotations
 
@@ -122,8 +119,6 @@ def test_a_model_file_that_failed_is_read_again(tmp_path: Path) -> None:
     assert find_model("later.py:Fan", tmp_path).model == "fan"
 
 
-# ---- modules beside a model file ----
-
 USES_SCALES = """\
 from multidrop import Drive, reading
 from scales import STEP
@@ -212,9 +207,6 @@ def test_a_module_missing_beside_a_model_file_is_reported(tmp_path: Path) -> Non
     assert refused("fan.py:Fan", directory).endswith(ending)
 
 
-# ---- multidrop completion ----
-
-
 TYPED = {
     "multidrop po": {"ports", "poll"},
     "multidrop fleet wa": {"watch"},
@@ -237,9 +229,6 @@ def test_bash_completes_words_with_the_generated_script(run: Run, tmp_path: Path
     done = subprocess.run(["bash"], input=script, cwd=tmp_path, capture_output=True, text=True, timeout=60)
     found = [set(line.split()) for line in done.stdout.splitlines()]
     assert dict(zip(TYPED, found, strict=True)) == TYPED
-
-
-# ---- sheets ----
 
 
 def test_models_lists_the_families(run: Run) -> None:

@@ -111,9 +111,6 @@ def texts(lines: list[Any]) -> list[str]:
     return [line.plain for line in lines]
 
 
-# ---- states and histories ----
-
-
 def test_the_monitor_derives_a_drives_state_from_polled_registers(watched: LivePlant) -> None:
     assert [(drive.state, drive.fault, drive.why_silent) for drive in watched.drives] == [
         ("running", "", ""),
@@ -177,9 +174,6 @@ def test_the_monitors_history_has_values_of_one_register_only(tmp_path: Path) ->
         live.add(from_rows([row("drive-1", name, value)]))
         live.remember()
     assert list(live.drives[0].history) == [None, 50.0]
-
-
-# ---- pictures ----
 
 
 def test_the_overview_shows_states_in_words(watched: LivePlant) -> None:
@@ -355,9 +349,6 @@ def test_the_page_of_a_drive_scrolls_to_its_last_row(watched: LivePlant) -> None
     assert lines[9].strip()
     registers = watched.drives[0].polled.drive.registers.values()
     assert f"of {len([register for register in registers if register.readable])}" in lines[-2]
-
-
-# ---- keys ----
 
 
 class Poller:
@@ -594,9 +585,6 @@ def test_no_key_can_do_more_than_stop_motors(screened: Screened) -> None:
         for answer in "yY\r ":
             screened.press([key, answer])
     assert set(screened.poller.asked) <= {"stop all", *(f"drive-{at} control STOP" for at in (1, 2, 3))}
-
-
-# ---- on a terminal ----
 
 
 def leave(terminal: Terminal) -> None:

@@ -44,7 +44,7 @@ def edited(path: str, before: str, after: str) -> None:
     Path(path).write_text(text.replace(before, after))
 
 
-def test_saved_parameters_can_be_compared(run: Run, drive: tuple[object, ...], sim: MotorDrive) -> None:
+def test_saved_parameters_can_be_applied_again(run: Run, drive: tuple[object, ...], sim: MotorDrive) -> None:
     assert run("params", "save", *drive, "pump.toml")[0] == 0
     assert run("params", "diff", "pump.toml", *drive)[0] == 0
     sim["acceleration_time"] = 25.0
@@ -68,7 +68,7 @@ def test_apply_writes_only_after_confirmation(run: Run, drive: tuple[object, ...
     assert "Write 1 parameter to" in err
 
 
-def test_a_second_write_needs_an_option(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_refused_write_names_its_option(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     # shorter, because with the manual's silences the test would take 2 s
@@ -106,7 +106,7 @@ def test_commissioning_needs_a_terminal(run: Run, drive: tuple[object, ...], sim
     assert json.loads(Path("audit.jsonl").read_text())["commissioning"] is True
 
 
-def test_apply_refuses_to_write_while_it_runs(run: Run, drive: tuple[object, ...], sim: MotorDrive) -> None:
+def test_apply_never_writes_to_running_motors(run: Run, drive: tuple[object, ...], sim: MotorDrive) -> None:
     run("params", "save", *drive, "pump.toml")
     sim["acceleration_time"] = 25.0
     sim.motor.target = 40.0

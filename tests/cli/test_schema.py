@@ -109,8 +109,6 @@ def check_refusals(kind: str, invalid: Sequence[str]) -> None:
     assert len(accepted) <= (1 - LEAST) * len(invalid), accepted
 
 
-# ---- plant files ----
-
 SERVE = """\
 [serve]
 listen = "0.0.0.0:8443"
@@ -260,9 +258,6 @@ def test_schema_refuses_mistakes_in_the_fleet_table() -> None:
     plant = PLANTS.HEAD + PLANTS.TOY
     assert accepts("plant", f'{plant}[fleet]\nmay.write = ["pump-*.setpoint"]\n')
     assert [line for line in BAD_FLEET.splitlines() if accepts("plant", f"{plant}[fleet]\n{line}\n")] == []
-
-
-# ---- family files ----
 
 
 def invalid_families() -> list[str]:

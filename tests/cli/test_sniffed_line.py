@@ -46,8 +46,6 @@ def drives() -> list[Drive]:
     ]
 
 
-# ---- other programs' masters ----
-
 Said = tuple[int, int, list[int] | int]  # address, function, and values or minus the exception code
 NUMBERS = itertools.count(1)  # each number is written only once, so that each exchange is unique
 
@@ -129,9 +127,6 @@ def test_every_exchange_of_a_mixed_line_is_sniffed() -> None:
         "unknown_bytes": 0,
     }
     assert {record["framing"] for record in told[:-1]} == {"rtu", "ascii", "delixi"}
-
-
-# ---- with damaged bytes ----
 
 
 @dataclass

@@ -1,7 +1,4 @@
-"""If a task or thread that a fleet's gateway needs has ended, this is logged and the gateway shuts down.
-
-A failure on one line affects only that line.
-"""
+"""If a task or thread that a fleet's gateway needs has ended, this is logged and the gateway shuts down."""
 
 from __future__ import annotations
 
@@ -80,17 +77,11 @@ def test_only_listed_modules_of_the_fleet_start_tasks_or_threads() -> None:
     assert found <= WAITED_FOR
 
 
-# ---- a gateway ----
-
-
 @pytest.fixture
 def gateway(
     fleet: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[Callable[[Callable[[FleetGateway], Awaitable[object]]], None]]:
-    """Return a function that runs a gateway on real servers until it ends.
-
-    The function calls its argument with the gateway as soon as the gateway is ready.
-    """
+    """Return a function that runs a gateway on real servers, and calls its argument with it when ready."""
 
     def run(act: Callable[[FleetGateway], Awaitable[object]]) -> None:
         async def main() -> None:
@@ -197,9 +188,6 @@ async def test_a_command_client_reports_the_end_of_its_connection(fleet: Cluster
             await asyncio.wait_for(commands.stay(), 60)
 
 
-# ---- failures after which the gateway continues ----
-
-
 async def test_an_unexpected_failure_of_the_forwarder_is_logged_and_it_retries(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -279,9 +267,6 @@ def test_a_stop_that_raises_is_answered(tmp_path: Path, monkeypatch: pytest.Monk
         answer = asyncio.run(desk.stop())
     assert (answer.outcome, answer.ok) == (CommandOutcome.UNKNOWN, False)
     assert "it is not known whether the stop was sent" in answer.text
-
-
-# ---- failures on one line ----
 
 
 class Taken:

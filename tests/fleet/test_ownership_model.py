@@ -40,10 +40,7 @@ Records = tuple[Stored, ...]
 
 
 class Session(NamedTuple):
-    """The ownership records that a gateway's session has read.
-
-    `given` has the records that it is releasing.
-    """
+    """The ownership records that a gateway's session has read, and in `given` those that it is releasing."""
 
     known: Records = (Stored(),) * BUCKETS
     given: frozenset[tuple[int, int]] = frozenset()
@@ -62,10 +59,7 @@ def owner_called(name: str) -> Owner:
 
 @lru_cache(1 << 16)
 def as_read(records: Records) -> LineRecords:
-    """Return the records in the form that the tested code reads.
-
-    The turn is always 1, because it is only for display.
-    """
+    """Return the records in the form that the tested code reads. The turn, which is only shown, is 1."""
     return {
         f"bucket {at}": Record(
             "line",
@@ -95,10 +89,7 @@ class Model:
     minds_who_lives: bool = True
 
     def search(self) -> tuple[int, State | None]:
-        """Try all orders of steps.
-
-        Return the number of states, and a state with two masters or a lost line (or None).
-        """
+        """Try all orders of steps; return the number of states, and one with two masters or a lost line."""
         nothing = (Stored(),) * BUCKETS
         first = State(nothing, (Session(),) * len(self.sessions), frozenset())
         known, layer = {first}, [first]
@@ -308,8 +299,6 @@ class LeaseModel:
     listens: bool = True  # during the guard time, the taker only listens
     lateness: int = 0  # delay of the kernel's timer, in ticks
 
-    # ---- one path ----
-
     def path_steps(self, path: PathState) -> Iterator[PathState]:
         """Yield all possible next states of one lease record."""
         if path.request is None and path.ack is None:
@@ -361,8 +350,6 @@ class LeaseModel:
         seen = path.seen if path.seen and path.seen[0] else None
         request = path.request if path.ended is None else None
         return path._replace(seen=seen, request=request, ending=path.ending or None)
-
-    # ---- all interleavings ----
 
     def deadline(self, renewed: Iterable[int | None]) -> int:
         """Return until when the holder may send, relative to now. `renewed` has the ages of its renewals."""
@@ -465,18 +452,17 @@ LEASE_MUTATIONS = {
 }
 
 
-@pytest.mark.long
-def test_no_order_of_renewals_and_takeovers_gives_two_masters() -> None:
-    states, wrong = LeaseModel(SMALL).search()
+@pytest.mark.parametrize(
+    ("terms", "least"),
+    [
+        pytest.param(SMALL, 100_000, marks=pytest.mark.long),
+        pytest.param(WHOLE, 500_000, marks=pytest.mark.nightly),
+    ],
+)
+def test_no_order_of_renewals_and_takeovers_gives_two_masters(terms: Terms, least: int) -> None:
+    states, wrong = LeaseModel(terms).search()
     assert wrong is None
-    assert states > 100_000
-
-
-@pytest.mark.nightly
-def test_no_order_of_renewals_and_takeovers_of_longer_leases_gives_two_masters() -> None:
-    states, wrong = LeaseModel(WHOLE).search()
-    assert wrong is None
-    assert states > 500_000
+    assert states > least
 
 
 LARGE = ("deadline from the acknowledgement", "guard shorter than the timer's lateness", "needs 1, ends 2")

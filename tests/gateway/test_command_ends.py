@@ -60,7 +60,7 @@ class UnopenedLines:
     ],
     ids=["a write", "a verb", "a stop", "a stop of all"],
 )
-def test_the_end_time_of_a_drives_last_command(command: Callable[[Commands], Awaitable[Any]]) -> None:
+def test_the_end_time_of_the_last_command_is_known(command: Callable[[Commands], Awaitable[Any]]) -> None:
     commands = Commands(UnopenedLines(), MAY)
     assert commands.ended_ns("mill") == 0
     begun_ns = time.monotonic_ns()
@@ -80,13 +80,10 @@ def test_the_end_time_of_a_drives_last_command(command: Callable[[Commands], Awa
     ],
     ids=["a write", "a verb"],
 )
-def test_the_result_of_a_command_names_a_drive_that_was_removed_from_its_line(
+async def test_the_result_of_a_command_names_a_drive_that_was_removed_from_its_line(
     command: Callable[[Commands], Awaitable[CommandResult]],
 ) -> None:
-    async def carry_out() -> CommandResult:
-        return await command(Commands(UnopenedLines(), MAY))
-
-    told = asyncio.run(carry_out())
+    told = await command(Commands(UnopenedLines(), MAY))
     assert not told.ok
     assert told.text.startswith("mill is ")
 
@@ -120,7 +117,7 @@ async def test_a_refused_command_has_no_end_time() -> None:
 
 
 @pytest.mark.parametrize("verb", ["stop", "coast"])
-def test_only_stops_accept_another_unicode_spelling(verb: str) -> None:
+async def test_only_stops_accept_another_unicode_spelling(verb: str) -> None:
     """A u with two dots is one character (U+00FC) on some keyboards, and two (U+0075 U+0308) on others."""
     fan, spelt = "L\u00fcfter", "Lu\u0308fter"
     line, known, _ = one(InvtCHE(1, name=fan, maximum_frequency=50))
@@ -129,22 +126,13 @@ def test_only_stops_accept_another_unicode_spelling(verb: str) -> None:
     lines.bus = lambda name: known.bus  # type: ignore[method-assign, assignment, return-value]
     may = May(write=frozenset({f"{spelt}.setpoint"}), verbs=frozenset({f"{spelt}.start", f"{fan}.coast"}))
     commands = Commands(lines, may)
-
-    async def carry_out() -> list[CommandResult]:
-        started = [
-            await commands.act(spelt, "start", {}, CALLER),
-            await commands.write(spelt, "setpoint", 10.0, CALLER),
-        ]
-        assert line.written == []
-        assert {told.ok for told in started} == {False}
-        if verb == "stop":
-            stopped = await commands.stop([spelt], CALLER)
-            assert [*stopped] == [spelt]
-            return [stopped[spelt], await commands.act(spelt, verb, {}, CALLER)]
-        return [await commands.act(spelt, verb, {}, CALLER)]
-
-    for told in asyncio.run(carry_out()):
+    assert not (await commands.act(spelt, "start", {}, CALLER)).ok
+    assert not (await commands.write(spelt, "setpoint", 10.0, CALLER)).ok
+    assert line.written == []
+    stopped = await commands.stop([spelt], CALLER) if verb == "stop" else {}
+    for told in (*stopped.values(), await commands.act(spelt, verb, {}, CALLER)):
         assert told.ok, told.text
+    assert [*stopped] == [spelt] * (verb == "stop")
     assert line.written
     assert commands.stopped_ns(fan) is not None
 

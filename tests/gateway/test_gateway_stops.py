@@ -9,13 +9,14 @@ import re
 import shlex
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from errno import ENOSPC
 from importlib.resources import files
 from pathlib import Path
 from time import monotonic
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from broken_part import BrokenFeed
@@ -47,24 +48,9 @@ def _broken_parts(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setitem(parts.PARTS, name, "broken_part")  # type: ignore[arg-type]
 
 
-def start(gateway: Served, *drives: str) -> None:
-    """Start the motors of these drives through the gateway's Commands."""
-    writer = {"authorization": gateway.bearer(Right.WRITE)}
-    for drive in drives:
-        value = {"drive": drive, "register": "setpoint", "value": 50.0}
-        assert gateway.command("/api/write", value, **writer).json["done"] is True
-        told = gateway.command("/api/act", {"drive": drive, "verb": "start", "options": {}}, **writer).json
-        assert (told["done"], told["text"]) == (True, f"{drive}: start is done")
-        assert gateway.sims[drive].motor.goal  # type: ignore[attr-defined]
-
-
 def calling(gateway: Served) -> socket.socket:
     """Return an HTTP connection to a gateway. A `with` block closes it."""
     return socket.create_connection(("127.0.0.1", gateway.gateway.port), PATIENCE)
-
-
-def stands(gateway: Served, drive: str) -> bool:
-    return not gateway.sims[drive].motor.goal  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize(
@@ -119,13 +105,13 @@ def test_a_stop_continues_without_its_client(gateway: Served, monkeypatch: pytes
 
 @pytest.mark.slow
 def test_a_stop_of_all_drives_is_sent_and_verified(gateway: Served) -> None:
-    start(gateway, "pump-1", "pump-2")
+    gateway.start("pump-1", "pump-2")
     gateway.await_state("pump-1", "runs")
     told = gateway.post("/api/stop", {"drives": None}).json
     assert {name: one["done"] for name, one in told.items()} == {"pump-1": True, "pump-2": True}
     assert all("seen to stand" in one["text"] for one in told.values())
-    assert stands(gateway, "pump-1")
-    assert stands(gateway, "pump-2")
+    assert gateway.stands("pump-1")
+    assert gateway.stands("pump-2")
     gateway.await_state("pump-1", "stands")
 
 
@@ -170,33 +156,29 @@ def gateway(tmp_path: Path) -> Iterator[Served]:
 def test_an_unreadable_stop_stops_all(gateway: Served, monkeypatch: pytest.MonkeyPatch, body: bytes) -> None:
     monkeypatch.setattr(messages, "STOP_BODY_S", 0.1)
     with calling(gateway) as client:
-        start(gateway, "pump-1", "pump-2")
+        gateway.start("pump-1", "pump-2")
         client.sendall(STOP + body)
         response = http.client.HTTPResponse(client)
         response.begin()
         told = json.loads(response.read())
         assert {name: one["done"] for name, one in told.items()} == {"pump-1": True, "pump-2": True}
-        assert stands(gateway, "pump-1")
-        assert stands(gateway, "pump-2")
+        assert gateway.stands("pump-1")
+        assert gateway.stands("pump-2")
 
 
 @pytest.mark.slow
-def test_a_stop_accepts_the_name_of_one_drive_instead_of_a_list(gateway: Served) -> None:
-    start(gateway, "pump-1", "pump-2")
-    assert [*gateway.request("POST", "/api/stop", {"drives": "pump-1"}).json] == ["pump-1"]
-    assert stands(gateway, "pump-1")
-    assert not stands(gateway, "pump-2")
-
-
-@pytest.mark.slow
-def test_a_stop_with_unknown_names_stops_the_known_drives_and_reports_each_name(gateway: Served) -> None:
-    """Unknown names: a lone surrogate, an escape sequence for terminals, and a drive's name in capitals."""
-    names = ["pump-1", "\ud800", "\x1b[2J\n", "PUMP-2", ""]
-    start(gateway, "pump-1")
-    told = gateway.request("POST", "/api/stop", {"drives": names}).json
-    assert stands(gateway, "pump-1")
+@table("drives", ["pump-1", ["pump-1"], ["pump-1", "\ud800", "\x1b[2J\n", "PUMP-2", "", "pump-9"]])
+def test_a_stop_stops_the_drives_that_it_names(gateway: Served, drives: str | list[str]) -> None:
+    """Names of other drives: a lone surrogate, an escape sequence for terminals, a name in capitals."""
+    gateway.start("pump-1", "pump-2")
+    told = gateway.post("/api/stop", {"drives": drives}).json
+    assert [*told] == ([drives] if isinstance(drives, str) else drives)
     assert [name for name, one in told.items() if one["done"]] == ["pump-1"]
-    assert [*told] == names
+    assert [told[name]["text"] for name in told if name == "pump-9"] == ["there is no drive 'pump-9'"] * (
+        "pump-9" in drives
+    )
+    assert gateway.stands("pump-1")
+    assert not gateway.stands("pump-2")
 
 
 @pytest.mark.long
@@ -204,37 +186,27 @@ def test_a_stop_with_unknown_names_stops_the_known_drives_and_reports_each_name(
 @table("options", [None, [], "now", {"direction": "forward"}])
 def test_a_stop_verb_with_wrong_options_is_sent(gateway: Served, verb: str, options: object) -> None:
     """Some programs send null instead of an empty object."""
-    start(gateway, "pump-1")
+    gateway.start("pump-1")
     body = {"drive": "pump-1", "verb": verb, "options": options}
     assert gateway.post("/api/act", body).json["done"] is True
-    assert stands(gateway, "pump-1")
+    assert gateway.stands("pump-1")
 
 
 @pytest.mark.slow
 def test_a_stop_with_a_truncated_body_is_sent(gateway: Served) -> None:
-    start(gateway, "pump-1", "pump-2")
+    gateway.start("pump-1", "pump-2")
     with calling(gateway) as client:
         client.sendall(STOP + b'100\r\n\r\n{"drives": ["pump-1", "pu')
-    until(lambda: stands(gateway, "pump-1") and stands(gateway, "pump-2"))
+    until(lambda: gateway.stands("pump-1") and gateway.stands("pump-2"))
 
 
 @pytest.mark.slow
 def test_a_stop_without_the_right_is_not_sent(tmp_path: Path) -> None:
     with served(tmp_path, MAY.replace('stop = "anyone"\n', "")) as gateway, calling(gateway) as client:
-        start(gateway, "pump-1", "pump-2")
+        gateway.start("pump-1", "pump-2")
         client.sendall(STOP + UNREADABLE["late"])
         assert client.recv(1000).startswith(b"HTTP/1.1 401 ")
         assert gateway.gateway.commands.stops == {}
-
-
-@pytest.mark.slow
-def test_a_stop_of_one_drive_leaves_the_other_running(gateway: Served) -> None:
-    start(gateway, "pump-1", "pump-2")
-    told = gateway.post("/api/stop", {"drives": ["pump-1", "pump-9"]}).json
-    assert told["pump-1"]["done"] is True
-    assert (told["pump-9"]["done"], told["pump-9"]["text"]) == (False, "there is no drive 'pump-9'")
-    assert stands(gateway, "pump-1")
-    assert not stands(gateway, "pump-2")
 
 
 @pytest.mark.slow
@@ -242,7 +214,7 @@ def test_a_stop_of_one_drive_leaves_the_other_running(gateway: Served) -> None:
 def test_a_stop_works_while_all_gateway_parts_fail(tmp_path: Path) -> None:
     with served(tmp_path, BROKEN) as gateway:
         assert isinstance(gateway.gateway.feeds["mqtt"], BrokenFeed)
-        start(gateway, "pump-1", "pump-2")
+        gateway.start("pump-1", "pump-2")
         until(lambda: gateway.gateway.failures.get("history", 0) > 3)
         told = gateway.post("/api/stop").json
         assert [one["done"] for one in told.values()] == [True, True]
@@ -260,7 +232,7 @@ def test_a_stop_works_while_all_gateway_parts_fail(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_stop_works_while_values_cannot_be_shown(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
-    start(gateway, "pump-1", "pump-2")
+    gateway.start("pump-1", "pump-2")
 
     def fail(*arguments: object, **more: object) -> None:
         raise ZeroDivisionError
@@ -278,7 +250,7 @@ def test_a_stop_works_while_values_cannot_be_shown(gateway: Served, monkeypatch:
 def test_a_stop_does_not_wait_for_hanging_writes(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     """MOST_WRITES writes hang, so further writes are refused; stops are still sent."""
     held, entered = threading.Event(), []
-    start(gateway, "pump-1", "pump-2")
+    gateway.start("pump-1", "pump-2")
     pump = gateway.gateway.bus("hall").drives[0]
 
     def hang(*arguments: object) -> None:
@@ -287,12 +259,10 @@ def test_a_stop_does_not_wait_for_hanging_writes(gateway: Served, monkeypatch: p
         raise ValueError("it was held up")
 
     monkeypatch.setattr(type(pump), "try_write", hang)
-    writer = {"authorization": gateway.bearer(Right.WRITE)}
     found: list[str] = []
 
     def write(value: float) -> None:
-        body = {"drive": "pump-1", "register": "setpoint", "value": value}
-        found.append(gateway.command("/api/write", body, **writer).json["text"])
+        found.append(gateway.write("pump-1", "setpoint", value)["text"])
 
     writes = [threading.Thread(target=write, args=(float(value),)) for value in range(12)]
     try:
@@ -323,13 +293,9 @@ def test_commands_called_before_a_stop_are_not_sent_after_it(gateway: Served) ->
             begun.append(self)
 
     commands = gateway.gateway.commands
-    start(gateway, "pump-1")
-    writer = {"authorization": gateway.bearer(Right.WRITE)}
-    body = {"drive": "pump-1", "verb": "start", "options": {}}
+    gateway.start("pump-1")
     told: list[str] = []
-    asked = threading.Thread(
-        target=lambda: told.append(gateway.command("/api/act", body, **writer).json["text"])
-    )
+    asked = threading.Thread(target=lambda: told.append(gateway.act("pump-1", "start")["text"]))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("multidrop.supervisor.threading", SimpleNamespace(Thread=Late))
         asked.start()
@@ -338,7 +304,7 @@ def test_commands_called_before_a_stop_are_not_sent_after_it(gateway: Served) ->
     threading.Thread.start(begun[0])
     asked.join()
     assert told == ["pump-1.start was not sent: a stop was called"]
-    assert stands(gateway, "pump-1")
+    assert gateway.stands("pump-1")
     assert commands.called == 4
 
 
@@ -348,38 +314,20 @@ def test_a_stop_is_sent_although_no_thread_can_be_started(gateway: Served) -> No
         def start(self) -> None:
             raise RuntimeError("can't start new thread")
 
-    start(gateway, "pump-1")
+    gateway.start("pump-1")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("multidrop.supervisor.threading", SimpleNamespace(Thread=NoThread))
-        writer = {"authorization": gateway.bearer(Right.WRITE)}
-        body = {"drive": "pump-1", "register": "setpoint", "value": 10.0}
-        told = gateway.command("/api/write", body, **writer).json
+        told = gateway.write("pump-1", "setpoint", 10.0)
         assert (told["done"], told["text"]) == (False, "can't start new thread")
         assert gateway.post("/api/stop").json["pump-1"]["done"] is True
-    assert stands(gateway, "pump-1")
-
-
-@pytest.mark.long
-@pytest.mark.slow
-def test_a_stop_is_repeated_to_a_silent_drive_without_delaying_other_stops(gateway: Served) -> None:
-    start(gateway, "pump-1", "pump-2")
-    gateway.sims["pump-2"].deaf_until = float("inf")
-    gateway.await_state("pump-2", "silent")
-    found: list[object] = []
-    asked = threading.Thread(target=lambda: found.append(gateway.post("/api/stop").json))
-    asked.start()
-    until(lambda: stands(gateway, "pump-1"))
-    gateway.sims["pump-2"].deaf_until = 0.0
-    asked.join()
-    assert stands(gateway, "pump-2")
-    assert [one["done"] for one in found[0].values()] == [True, True]  # type: ignore[attr-defined]
+    assert gateway.stands("pump-1")
 
 
 @pytest.mark.long
 def test_many_stops_of_a_silent_drive_do_not_delay_the_stop_of_another(gateway: Served) -> None:
     """Of the 40 stops, the gateway repeats only one, so it can send the other drive's stop immediately."""
     with ThreadPoolExecutor(40) as callers:
-        start(gateway, "pump-1", "pump-2")
+        gateway.start("pump-1", "pump-2")
         gateway.sims["pump-2"].deaf_until = float("inf")
         calls = [callers.submit(gateway.post, "/api/stop", {"drives": ["pump-2"]}) for _ in range(40)]
         until(lambda: gateway.gateway.commands.stops["pump-2"] == 40)
@@ -388,7 +336,7 @@ def test_many_stops_of_a_silent_drive_do_not_delay_the_stop_of_another(gateway: 
         assert monotonic() - begun < 12.0  # s; the motor's ramp takes 3 s
         gateway.sims["pump-2"].deaf_until = 0.0
         assert [call.result().json["pump-2"]["done"] for call in calls] == [True] * 40
-        assert stands(gateway, "pump-2")
+        assert gateway.stands("pump-2")
 
 
 @pytest.mark.slow
@@ -419,7 +367,7 @@ def test_of_many_coasts_of_a_silent_drive_only_one_is_repeated(
 def test_a_stop_of_a_motor_that_was_started_again_is_sent_as_a_new_stop(gateway: Served) -> None:
     """The first stop is still repeated to the silent drive, but has ended for the other."""
     with ThreadPoolExecutor(1) as caller:
-        start(gateway, "pump-1", "pump-2")
+        gateway.start("pump-1", "pump-2")
         gateway.sims["pump-2"].deaf_until = float("inf")
         whole = caller.submit(gateway.post, "/api/stop", {})
         motor = gateway.sims["pump-1"].motor  # type: ignore[attr-defined]
@@ -430,41 +378,32 @@ def test_a_stop_of_a_motor_that_was_started_again_is_sent_as_a_new_stop(gateway:
         told = gateway.post("/api/stop", {"drives": ["pump-1"]}).json["pump-1"]
         assert told["done"]
         assert told["text"].startswith("stopped: seen to stand after")
-        assert stands(gateway, "pump-1")
+        assert gateway.stands("pump-1")
         assert not whole.done()
         gateway.sims["pump-2"].deaf_until = 0.0
-        whole.result()
+        assert [one["done"] for one in whole.result().json.values()] == [True, True]
+        assert gateway.stands("pump-2")
 
 
 @pytest.mark.slow
 def test_verbs_and_writes_are_answered_with_their_results(gateway: Served) -> None:
-    writer = {"authorization": gateway.bearer(Right.WRITE)}
-
     def act(verb: str, **options: object) -> str:
-        body = {"drive": "pump-1", "verb": verb, "options": options}
-        text: str = gateway.command("/api/act", body, **writer).json["text"]
-        return text
+        return str(gateway.act("pump-1", verb, **options)["text"])
 
     def write(value: float) -> str:
-        body = {"drive": "pump-1", "register": "setpoint", "value": value}
-        text: str = gateway.command("/api/write", body, **writer).json["text"]
-        return text
+        return str(gateway.write("pump-1", "setpoint", value)["text"])
 
     assert write(50.0) == "pump-1: setpoint = 50.00 %: done (read back)"
     assert write(150.0) == (
         "pump-1: setpoint = 150 is outside 0 to 100 % (manual: CHE100 manual v1.4, p. 117)"
     )
     assert "takes a finite number, not nan" in write(float("nan"))
-    told = gateway.command(
-        "/api/write", {"drive": "pump-1", "register": "control", "value": 1.5}, **writer
-    ).json
+    told = gateway.write("pump-1", "control", 1.5)
     assert told["text"] == "control takes the name or the number of a choice, not 1.5"
-    told = gateway.command(
-        "/api/write", {"drive": "pump-1", "register": "control", "value": 1}, **writer
-    ).json
+    told = gateway.write("pump-1", "control", 1)
     assert told["done"] is False
     assert "start" in told["text"]
-    assert stands(gateway, "pump-1")
+    assert gateway.stands("pump-1")
     assert act("fly") == (
         "there is no verb 'fly'; there are start, jog, reset_fault, set_frequency, coast, "
         "emergency_stop, stop"
@@ -485,18 +424,16 @@ def test_without_an_audit_log_only_stops_are_sent(tmp_path: Path, monkeypatch: p
         raise OSError(ENOSPC, "No space left on device")
 
     with served(tmp_path, f'[serve]\naudit = "audit.jsonl"\n{MAY}') as gateway:
-        writer = {"authorization": gateway.bearer(Right.WRITE)}
-        commands: list[tuple[str, dict[str, object]]] = [
-            ("/api/write", {"drive": "pump-1", "register": "setpoint", "value": 50.0}),
-            ("/api/act", {"drive": "pump-1", "verb": "start", "options": {}}),
+        commands: list[Callable[[], Any]] = [
+            lambda: gateway.write("pump-1", "setpoint", 50.0),
+            lambda: gateway.act("pump-1", "start"),
         ]
-        first = {"drive": "pump-1", "register": "setpoint", "value": 40.0}
-        assert gateway.command("/api/write", first, **writer).json["done"] is True
+        assert gateway.write("pump-1", "setpoint", 40.0)["done"] is True
         with monkeypatch.context() as full:
             full.setattr(AuditLog, "add", fail)
             before = len(gateway.sims["pump-1"].counters.writes)
-            for path, body in commands:
-                told = gateway.command(path, body, **writer).json
+            for command in commands:
+                told = command()
                 assert told["done"] is False
                 assert told["text"].endswith(
                     " was not sent: the audit log cannot be written: No space left on device"
@@ -505,7 +442,7 @@ def test_without_an_audit_log_only_stops_are_sent(tmp_path: Path, monkeypatch: p
             assert [one["done"] for one in gateway.post("/api/stop").json.values()] == [True, True]
             assert len(gateway.sims["pump-1"].counters.writes) > before
             assert gateway.get("/health").json["audit"].endswith("No space left on device")
-        assert [gateway.command(*one, **writer).json["done"] for one in commands] == [True, True]
+        assert [command()["done"] for command in commands] == [True, True]
         assert gateway.get("/health").json["audit"] == "ok"
 
 

@@ -39,7 +39,7 @@ from multidrop.cli import main
 threading.Thread(target=threading.Event().wait).start()
 main(["serve", sys.argv[1]])
 """
-SETPOINT = {"drive": "pump-1", "register": "setpoint", "value": 10.0}
+SETPOINT = "pump-1", "setpoint", 10.0
 
 
 @pytest.fixture(autouse=True)
@@ -88,18 +88,10 @@ def assert_stops_and_polls(gateway: Served) -> None:
     until(lambda: health(gateway)["newest_row"] > newest)
 
 
-def write(gateway: Served) -> Any:
-    return gateway.command("/api/write", SETPOINT, authorization=gateway.bearer(Right.WRITE)).json
-
-
 def reload_as(gateway: Served, serve: str) -> Any:
     path = gateway.gateway.plant.path
     path.write_text(path.read_text().partition("[serve")[0] + serve)
-    headers = {"authorization": gateway.bearer(Right.WRITE)}
-    return gateway.post("/api/reload", {"confirm": True}, **headers).json
-
-
-# ---- history ----
+    return gateway.post("/api/reload", {"confirm": True}, **gateway.writer).json
 
 
 def test_a_history_on_a_hanging_disk_starts_when_the_disk_answers(tmp_path: Path, fifos: Fifos) -> None:
@@ -188,9 +180,6 @@ def test_a_hanging_export_allows_the_shutdown(tmp_path: Path, monkeypatch: pytes
     go_on.set()
 
 
-# ---- the plant file ----
-
-
 def test_a_plant_file_that_hangs_fails_only_its_reload(
     tmp_path: Path, fifos: Fifos, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -229,9 +218,6 @@ def test_a_reload_does_not_wait_for_an_earlier_reload_that_hangs(tmp_path: Path,
         (tmp_path / "hangs").rename(path)
 
 
-# ---- audit log and ledger ----
-
-
 def test_a_hanging_log_allows_stops(tmp_path: Path, fifos: Fifos, monkeypatch: pytest.MonkeyPatch) -> None:
     for module in (settings, gateway_module):
         monkeypatch.setattr(module, "AUDIT_S", SHORT_S)
@@ -240,7 +226,7 @@ def test_a_hanging_log_allows_stops(tmp_path: Path, fifos: Fifos, monkeypatch: p
         assert_stops_and_polls(gateway)
         found = health(gateway)
         assert (found["status"], found["audit"]) == ("degraded", UNAUDITED)
-        told = write(gateway)
+        told = gateway.write(*SETPOINT)
         assert (told["done"], told["text"]) == (False, f"pump-1.setpoint = 10.0 was not sent: {UNAUDITED}")
         assert gateway.frame()["troubles"][0].startswith("audit log: ")
 
@@ -280,9 +266,6 @@ def test_a_hanging_ledger_and_audit_log_are_reported(tmp_path: Path, monkeypatch
         until(lambda: health(gateway)["status"] == "ok")
 
 
-# ---- the page's files ----
-
-
 def test_hanging_page_files_delay_no_other_request(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     go_on, read = threading.Event(), Path.read_bytes
 
@@ -302,9 +285,6 @@ def test_hanging_page_files_delay_no_other_request(tmp_path: Path, monkeypatch: 
         go_on.set()
         until(lambda: health(gateway)["status"] == "ok")
         until(lambda: gateway.get("/page/app.js").status == 200)
-
-
-# ---- shutdown ----
 
 
 @pytest.mark.long

@@ -87,8 +87,6 @@ def test_gateway_interrupted_at_any_bytecode_ends(drive: Counting, tmp_path: Pat
     assert every(step, act) > 1
 
 
-# ---- signals ----
-
 # If a callback of Python's import system raises KeyboardInterrupt, Python prints the error and continues.
 IN_AN_IMPORT = re.compile(
     r"Exception ignored in: .*\nTraceback \(most recent call last\):\n  File \"<frozen importlib.*\n"
@@ -125,10 +123,7 @@ def started(path: Path, number: int, *delays: float) -> BoundProcess[str]:
 def test_a_signal_at_any_moment_ends_the_command(
     tmp_path: Path, number: int, again: float | None, stride: int
 ) -> None:
-    """The moments are in the start, in service and in the shutdown.
-
-    A second signal ends the command at once.
-    """
+    """A second signal ends the command at once."""
     serve = '[serve]\nlisten = "127.0.0.1:0"\naudit = "audit.jsonl"\n[serve.may]\nstop = "anyone"\n'
     with simulated_plant(tmp_path, serve) as path:
         with started(path, number) as process:

@@ -26,8 +26,6 @@ from multidrop.exposition import MetricFamily, expose_metrics
 from multidrop.gateway.http.files import PAGE
 from multidrop.gateway.http.rights import Right
 
-# ---- a Prometheus server that scrapes a gateway ----
-
 
 class Prometheus:
     """A client of the HTTP API of a Prometheus server."""
@@ -242,9 +240,6 @@ def test_promtool_accepts_the_metrics(tmp_path: Path) -> None:
         assert answer.headers["content-type"] == "text/plain; version=0.0.4; charset=utf-8"
         checked = subprocess.run([program, "check", "metrics"], input=answer.body, capture_output=True)
         assert (checked.returncode, checked.stdout, checked.stderr) == (0, b"", b"")
-
-
-# ---- dashboard and alert rules in a real Prometheus ----
 
 
 FOLDER = PAGE / "prometheus"

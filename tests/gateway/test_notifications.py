@@ -59,10 +59,7 @@ def described(alarm: Alarm, left_out: int) -> dict[str, Any]:
 
 
 class Clocked:
-    """A sender of notifications with a simulated clock, `now_s`.
-
-    It records messages; `failure` makes it fail.
-    """
+    """A sender of notifications with a simulated clock. It records messages; `failure` makes it fail."""
 
     def __init__(self, most: int = 3600) -> None:
         self.now_s = 0.0
@@ -80,9 +77,6 @@ class Clocked:
         while (pause_s := self.sender.step()) == 0:
             pass
         return pause_s
-
-
-# ---- which alarms are sent ----
 
 
 def test_each_start_and_end_of_a_thousand_alarms_is_sent_as_one_message() -> None:
@@ -122,9 +116,6 @@ def test_a_restart_does_not_repeat_notifications() -> None:
     alarms.look(2_000, "pump", Shown(RUNS, ""))
     target.send_all()
     assert [one["event"] for one in target.messages] == ["end"]
-
-
-# ---- limits ----
 
 
 def test_the_newest_message_beyond_the_hourly_limit_is_sent_when_allowed() -> None:
@@ -198,9 +189,6 @@ def test_a_hanging_notification_target_does_not_delay_other_targets() -> None:
         sender.close()
     for thread in threads:
         thread.join()
-
-
-# ---- targets ----
 
 
 @pytest.fixture

@@ -31,7 +31,7 @@ MAY = '[serve.may]\nstop = "anyone"\nwrite = ["pump-1.setpoint"]\nverbs = ["pump
 
 
 def reload(gateway: Served) -> Any:
-    answer = gateway.post("/api/reload", {"confirm": True}, authorization=gateway.bearer(Right.WRITE))
+    answer = gateway.post("/api/reload", {"confirm": True}, **gateway.writer)
     assert answer.status == 200
     until(lambda: gateway.frame()["revision"] == gateway.gateway.revision)
     return answer.json
@@ -67,10 +67,7 @@ class Rows:
 def two_lines(
     folder: Path, serve: str = MAY, fans: Sequence[str] = ("fan-1",)
 ) -> Iterator[tuple[Served, Rows]]:
-    """Yield a gateway with the lines hall (pump-1) and roof (`fans`), and its rows.
-
-    Of the fans, only fan-1 answers.
-    """
+    """Yield a gateway with the lines hall (pump-1) and roof (`fans`; only fan-1 answers), and its rows."""
     secrets, known = tokens()
     sims = {name: simulated(InvtCHE(1, name=name, baudrate=38400)) for name in ("pump-1", "fan-1")}
     path = folder / "plant.toml"
@@ -208,12 +205,11 @@ def test_rights_names_and_tokens_are_reloaded_and_other_settings_need_a_restart(
         assert gateway.get("/health", host="old.example").status == 421
         assert gateway.get("/health", host="new.example").status == 200
         assert gateway.post("/api/stop").status == 401
-        writer = {"authorization": gateway.bearer(Right.WRITE)}
-        assert gateway.get("/api/plant", **writer).json["may"]["write"] == ["pump-2.setpoint"]
+        assert gateway.get("/api/plant", **gateway.writer).json["may"]["write"] == ["pump-2.setpoint"]
 
         def write(drive: str) -> Answer:
             body = {"drive": drive, "register": "setpoint", "value": 10.0}
-            return gateway.command("/api/write", body, **writer)
+            return gateway.command("/api/write", body, **gateway.writer)
 
         assert write("pump-1").status == 403
         assert write("pump-2").json["done"] is True
@@ -227,7 +223,7 @@ def test_before_a_restart_a_reload_gives_local_clients_no_further_rights(tmp_pat
 
 
 def test_a_reload_reports_that_a_renewed_certificate_needs_a_restart(tmp_path: Path) -> None:
-    """Otherwise users would notice only when the old certificate expires."""
+    """Users would notice only when the old certificate expires."""
     certificate(tmp_path, "own")
     serve = '[serve]\ncertificate = "own.pem"\nkey = "own.key"\n'
     with served(tmp_path, serve, tls=None) as gateway:
@@ -264,8 +260,7 @@ def test_a_token_removed_from_the_file_is_invalid_after_a_reload(tmp_path: Path)
             assert answers() == [200, 200, 200, 401]  # until the reload, the removed token is valid
             assert gateway.commands.plant_ns is None
             begun_ns = boottime_ns()
-            writer = {"authorization": client.bearer(Right.WRITE)}
-            assert client.post("/api/reload", {"confirm": True}, **writer).json["done"] is True
+            assert client.post("/api/reload", {"confirm": True}, **client.writer).json["done"] is True
             assert answers() == [401, 401, 200, 200]
             read_ns = gateway.commands.plant_ns  # time of the latest reload
             assert read_ns is not None
@@ -297,13 +292,12 @@ def test_a_reload_grants_no_rights_while_a_changed_address_needs_a_restart(tmp_p
     with served(tmp_path, serve) as gateway:
         edit(gateway, "127.0.0.1:0", "127.0.0.2:0")
         edit(gateway, 'look = "token"', 'stop = "anyone"')
-        writer = {"authorization": gateway.bearer(Right.WRITE)}
-        told = gateway.post("/api/reload", {"confirm": True}, **writer).json
+        told = gateway.post("/api/reload", {"confirm": True}, **gateway.writer).json
         assert told["restart"] == ["listen of [serve] takes effect after a restart"]
         assert gateway.get("/api/plant").status == 401
         assert gateway.post("/api/stop").status == 401
         edit(gateway, "127.0.0.2:0", "127.0.0.1:0")
-        assert gateway.post("/api/reload", {"confirm": True}, **writer).json["restart"] == []
+        assert gateway.post("/api/reload", {"confirm": True}, **gateway.writer).json["restart"] == []
         assert gateway.get("/api/plant").json["may"]["role"] == "stop"
 
 
@@ -313,8 +307,7 @@ def test_a_reload_needs_the_right_to_write_and_a_confirmation(tmp_path: Path) ->
         assert gateway.post("/api/reload", {"confirm": True}).status == 401
         stopper = {"authorization": gateway.bearer(Right.STOP)}
         assert gateway.post("/api/reload", {"confirm": True}, **stopper).status == 403
-        writer = {"authorization": gateway.bearer(Right.WRITE)}
-        unconfirmed = gateway.post("/api/reload", {}, **writer)
+        unconfirmed = gateway.post("/api/reload", {}, **gateway.writer)
         assert unconfirmed.status == 400
         assert unconfirmed.json == {
             "error": 'a reload changes what is polled: confirm it with {"confirm": true}'
@@ -333,7 +326,7 @@ def test_a_start_sent_before_a_reload_does_not_reach_a_new_drive_of_that_name(tm
         )
         assert reload(gateway)["done"] is True
         start = {"drive": "pump-1", "verb": "start", "options": {}, "seen": seen}
-        told = gateway.post("/api/act", start, authorization=gateway.bearer(Right.WRITE)).json
+        told = gateway.post("/api/act", start, **gateway.writer).json
         assert told["text"].startswith(
             f"pump-1.start was not sent: the plant file was reloaded after frame {seen}"
         )
@@ -341,14 +334,10 @@ def test_a_start_sent_before_a_reload_does_not_reach_a_new_drive_of_that_name(tm
 
 
 @pytest.mark.slow
-def test_a_stop_of_a_replaced_drive_reaches_the_new(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_during_a_reload_stops_the_new_drive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with two_lines(tmp_path, MAY.replace("pump-1", "fan-1")) as (gateway, _):
         revision = gateway.gateway.revision
-        writer = {"authorization": gateway.bearer(Right.WRITE)}
-        fan = gateway.sims["fan-1"].motor  # type: ignore[attr-defined]
-        gateway.command("/api/write", {"drive": "fan-1", "register": "setpoint", "value": 50.0}, **writer)
-        gateway.command("/api/act", {"drive": "fan-1", "verb": "start", "options": {}}, **writer)
-        assert fan.goal
+        gateway.start("fan-1")
         poller = gateway.gateway.poller
         assert poller is not None
         adopt, changed, answered = poller.adopt, threading.Event(), threading.Event()
@@ -380,7 +369,7 @@ def test_a_stop_of_a_replaced_drive_reaches_the_new(tmp_path: Path, monkeypatch:
             thread.join(PATIENCE)
         stops = [one for one in told if "fan-1" in one]
         assert [one["fan-1"]["done"] for one in stops] == [True, True]
-        assert not fan.goal
+        assert gateway.stands("fan-1")
         assert gateway.gateway.revision == revision + 1
 
 
@@ -405,11 +394,7 @@ def test_a_stop_does_not_await_new_ports(tmp_path: Path, monkeypatch: pytest.Mon
     verbs = '"fan-1.start", "fan-1.coast"'
     may = MAY.replace("pump-1", "fan-1").replace('"fan-1.start"', verbs)
     with two_lines(tmp_path, may, ("fan-1", "fan-2")) as (gateway, _):
-        writer = {"authorization": gateway.bearer(Right.WRITE)}
-        fan = gateway.sims["fan-1"].motor  # type: ignore[attr-defined]
-        gateway.command("/api/write", {"drive": "fan-1", "register": "setpoint", "value": 2.0}, **writer)
-        gateway.command("/api/act", {"drive": "fan-1", "verb": "start", "options": {}}, **writer)
-        assert fan.goal
+        gateway.start("fan-1")
         opening, go_on = held_up(monkeypatch)
         edit(gateway, 'name = "fan-1"', 'name = "fan-1"\nmaximum_frequency = 50.0')
         # the changed key makes the reload open this line again
@@ -423,9 +408,9 @@ def test_a_stop_does_not_await_new_ports(tmp_path: Path, monkeypatch: pytest.Mon
                 asked = "/api/act", {"drive": "fan-1", "verb": way, "options": {}}
             else:
                 asked = "/api/stop", {"drives": ["fan-1"]}
-            stopping = threading.Thread(target=lambda: gateway.post(*asked, **writer))
+            stopping = threading.Thread(target=lambda: gateway.post(*asked, **gateway.writer))
             stopping.start()
-            until(lambda: not fan.goal)
+            until(lambda: gateway.stands("fan-1"))
             assert reloading.is_alive()
         finally:
             go_on.set()

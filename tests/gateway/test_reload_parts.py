@@ -38,7 +38,7 @@ def reload(gateway: Served, serve: str) -> Any:
     """Reload the plant file with these [serve] tables, and return the gateway's answer."""
     path = gateway.gateway.plant.path
     path.write_text(path.read_text().partition("[serve")[0] + serve)
-    answer = gateway.post("/api/reload", {"confirm": True}, authorization=gateway.bearer(Right.WRITE))
+    answer = gateway.post("/api/reload", {"confirm": True}, **gateway.writer)
     assert answer.status == 200
     return answer.json
 
@@ -95,7 +95,7 @@ def test_a_reload_changes_nothing_if_a_gateway_part_cannot_be_opened(gateway: Se
 
 
 @pytest.mark.slow
-def test_a_failed_part_leaves_all_unchanged(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_part_that_fails_cancels_the_reload(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     first = free_port()
     assert reload(gateway, MODBUS.format(first, 21))["done"] is True
     build, failures = parts_module.build, [MemoryError("no memory")]
@@ -127,10 +127,8 @@ def test_a_part_that_loses_its_port_is_reported(gateway: Served, monkeypatch: py
     others[0].close()
     told = parts(gateway)["modbus"]
     assert told.startswith(f"[serve.modbus]: listen: 127.0.0.1:{first} cannot be opened")
-    assert [
-        one["done"]
-        for one in gateway.post("/api/stop", {}, authorization=gateway.bearer(Right.STOP)).json.values()
-    ] == [True, True]
+    stopped = gateway.post("/api/stop", {}, **gateway.writer).json
+    assert [one["done"] for one in stopped.values()] == [True, True]
     monkeypatch.undo()
     assert reload(gateway, MODBUS.format(first, 21)) == IN_EFFECT
     until(lambda: status_of(first, 21) == [3])
@@ -259,39 +257,32 @@ NEW_FAN = InvtCHE(2, name="fan")
 
 
 @pytest.mark.parametrize("names", [["fan"], None])
-def test_a_new_drive_is_stopped_while_its_predecessor_is_still_being_stopped(names: list[str] | None) -> None:
+async def test_a_new_drive_is_stopped_while_its_predecessor_is_still_being_stopped(
+    names: list[str] | None,
+) -> None:
     """The stop of the replaced drive may take half a minute, for example if that drive is silent."""
     silent = asyncio.Event()
     lines = Lines(plant_of(PUMP, FAN), held={FAN.address: silent})
-
-    async def main() -> dict[str, End]:
-        stopping = asyncio.create_task(stop_meant(lines, names, lines.stop))
-        await until_met(lambda: FAN in lines.begun)
-        lines.plant_coming = lines.plant_now = plant_of(NEW_FAN)
-        await until_met(lambda: NEW_FAN in lines.begun)
-        assert not stopping.done()
-        lines.plant_coming = None
-        silent.set()
-        return await stopping
-
-    ends = asyncio.run(main())
+    stopping = asyncio.create_task(stop_meant(lines, names, lines.stop))
+    await until_met(lambda: FAN in lines.begun)
+    lines.plant_coming = lines.plant_now = plant_of(NEW_FAN)
+    await until_met(lambda: NEW_FAN in lines.begun)
+    assert not stopping.done()
+    lines.plant_coming = None
+    silent.set()
     # the new drive's result, although that of the old drive came later
-    assert ends["fan"].drive is NEW_FAN
+    assert (await stopping)["fan"].drive is NEW_FAN
     assert lines.begun.count(NEW_FAN) == 1
 
 
-def test_a_stop_that_fails_while_a_reload_changes_lines_is_sent_again() -> None:
+async def test_a_stop_that_fails_while_a_reload_changes_lines_is_sent_again() -> None:
     silent = asyncio.Event()
     lines = Lines(plant_of(PUMP, FAN), held={FAN.address: silent}, failing={FAN.address})
-
-    async def main() -> dict[str, End]:
-        stopping = asyncio.create_task(stop_meant(lines, ["fan"], lines.stop))
-        await until_met(lambda: FAN in lines.begun)
-        lines.plant_now = plant_of(PUMP, FAN, InvtCHE(3, name="mill"))
-        silent.set()
-        return await stopping
-
-    assert not asyncio.run(main())["fan"].ok
+    stopping = asyncio.create_task(stop_meant(lines, ["fan"], lines.stop))
+    await until_met(lambda: FAN in lines.begun)
+    lines.plant_now = plant_of(PUMP, FAN, InvtCHE(3, name="mill"))
+    silent.set()
+    assert not (await stopping)["fan"].ok
     assert lines.begun == [FAN, FAN]
 
 

@@ -57,9 +57,6 @@ def test_gateway_modules_start_tasks_and_threads_only_through_the_supervisor() -
     assert found == {"opcua/server.py"}  # the OPC UA server cancels its own task when it closes
 
 
-# ---- tasks and threads of a gateway ----
-
-
 @pytest.fixture
 def gateway(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Served]:
     require_module("nats")
@@ -95,7 +92,9 @@ def test_a_gateway_has_exactly_the_expected_tasks_and_threads(gateway: Served) -
 
 
 @pytest.mark.parametrize("name", usually("polling", *sorted(TASKS - {"web", "polling"})))
-def test_stops_are_sent_without_a_task(gateway: Served, name: str, caplog: pytest.LogCaptureFixture) -> None:
+def test_stops_outlive_every_killed_task(
+    gateway: Served, name: str, caplog: pytest.LogCaptureFixture
+) -> None:
     assert dead(gateway) == {}
     in_loop(gateway.loop, lambda found: found.kept[name].cancel())
     until(lambda: dead(gateway) == {name: "it was cancelled"})
@@ -265,34 +264,23 @@ def test_each_thread_and_task_of_all_parts_is_listed_and_reported_if_it_ends(
         assert all(one["done"] for one in gateway.post("/api/stop").json.values())
 
 
-# ---- the supervisor alone ----
+async def test_a_released_task_that_ends_is_not_reported_as_dead() -> None:
+    supervisor().keep("released", asyncio.sleep(60))
+    supervisor().keep("let go of", asyncio.sleep(0))
+    await supervisor().release("released", "never there")
+    task = supervisor().let_go("let go of")
+    assert task is not None
+    await task
+    assert supervisor().dead == {}
 
 
-def test_a_released_task_that_ends_is_not_reported_as_dead() -> None:
-    async def live() -> dict[str, str]:
-        supervisor().keep("released", asyncio.sleep(60))
-        supervisor().keep("let go of", asyncio.sleep(0))
-        await supervisor().release("released", "never there")
-        task = supervisor().let_go("let go of")
-        assert task is not None
-        await task
-        return supervisor().dead
-
-    assert asyncio.run(live()) == {}
-
-
-def test_a_dead_task_that_is_started_again_is_no_longer_reported() -> None:
-    async def live() -> list[dict[str, str]]:
-        found = []
-        await asyncio.wait([supervisor().keep("part", asyncio.sleep(0))])
-        await asyncio.sleep(0)
-        found.append(dict(supervisor().dead))
-        supervisor().keep("part", asyncio.sleep(60))
-        found.append(dict(supervisor().dead))
-        await supervisor().release("part")
-        return found
-
-    assert asyncio.run(live()) == [{"part": "it returned"}, {}]
+async def test_a_dead_task_that_is_started_again_is_no_longer_reported() -> None:
+    await asyncio.wait([supervisor().keep("part", asyncio.sleep(0))])
+    await asyncio.sleep(0)
+    assert supervisor().dead == {"part": "it returned"}
+    supervisor().keep("part", asyncio.sleep(60))
+    assert supervisor().dead == {}
+    await supervisor().release("part")
 
 
 @pytest.mark.parametrize("failure", [ValueError("no"), SystemExit("no"), StopIteration("no")])
@@ -321,17 +309,14 @@ async def test_work_that_hangs_raises_hung_and_is_reported_until_later_work_succ
         await asyncio.sleep(0)
 
 
-def test_supervisor_within_raises_without_a_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_supervisor_within_raises_without_a_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(thread: threading.Thread) -> None:
         raise RuntimeError("can't start new thread")
 
-    async def live() -> list[str]:
-        with pytest.raises(RuntimeError, match="can't start new thread"):
-            await supervisor().within("work", 60, lambda: 3)
-        return supervisor().under_way
-
     monkeypatch.setattr(threading.Thread, "start", fail)
-    assert asyncio.run(live()) == []
+    with pytest.raises(RuntimeError, match="can't start new thread"):
+        await supervisor().within("work", 60, lambda: 3)
+    assert supervisor().under_way == []
 
 
 def test_function_in_time_returns_a_result_or_raises_hung_after_the_limit() -> None:

@@ -32,9 +32,6 @@ def _imported() -> None:
     from multidrop.report.health import MOST_REASONS, delays, draw_rates, line_uses, miss_shares, reasons_of
 
 
-# ---- loading ----
-
-
 def test_a_loaded_recording_has_every_value_and_every_miss(look: Recording) -> None:
     assert [(each.drive, each.register, each.unit, len(each.time)) for each in look.series] == [
         ("pump", "output_frequency", "Hz", 1000),
@@ -126,9 +123,6 @@ def test_a_recording_that_has_only_events_cannot_be_drawn(tmp_path: Path) -> Non
         load(path)
 
 
-# ---- delays and misses ----
-
-
 def test_the_response_delay_excludes_the_time_of_the_request(look: Recording) -> None:
     pump, fan = delays(look)
     assert pump.exact
@@ -177,9 +171,6 @@ def test_reasons_for_misses_beyond_the_limit_are_combined(tmp_path: Path) -> Non
     (_, misses) = draw_rates(load(record(tmp_path / "it.arrows", rows))).axes
     names = [text.get_text() for text in misses.get_legend().get_texts()]
     assert (names[0], len(names), names[-1]) == ("no reply", MOST_REASONS + 1, "other reasons")
-
-
-# ---- utilisation ----
 
 
 @pytest.mark.slow

@@ -103,7 +103,7 @@ def test_the_report_states_that_the_recording_has_no_plan(turns: list[Row], tmp_
 
 
 @pytest.mark.usefixtures("_unpainted")
-def test_a_long_recording_s_length_is_in_hours(tmp_path: Path) -> None:
+def test_the_length_of_a_long_recording_is_in_hours(tmp_path: Path) -> None:
     rows = [row(second, "pump", "output_frequency", 50.0) for second in (0, 7384)]
     assert "UTC, 2 h 03 min; 1 drive; 2 values" in report_page(load(record(tmp_path / "it.arrows", rows)))
 
@@ -126,8 +126,6 @@ def test_events_are_in_plots_and_reports(tmp_path: Path) -> None:
     assert '<td class="short">bearing &lt;b&gt;changed&lt;/b&gt;</td>' in page
     assert "1 miss" not in page
 
-
-# ---- invalid metadata ----
 
 ODD: list[Any] = [10**400, None, True, -1, 1e308, "", "x", [], [1], {}, {"a": {}}, {"FORWARD": 10**400}]
 
@@ -169,9 +167,6 @@ def test_invalid_parts_of_metadata_are_left_out_of_a_report(
         assert len(_about(look) + "".join(_drives(look))) > 100
         if metadata.get("planned") is odd or metadata.get("drives") is odd:
             assert report_page(look)
-
-
-# ---- steps of a test run ----
 
 
 EDGES = (2.0, 7.5, 19.0)  # start of each step in s; the last step is the stop

@@ -158,9 +158,6 @@ def test_the_value_axis_includes_zero_if_the_values_are_near_it(tmp_path: Path) 
         assert low == bottom if bottom is not None else 0 < low < least
 
 
-# ---- states ----
-
-
 STATUS = {  # metadata of status registers, as in the documents of these families
     "erman": {"STOPPED": 0, "RUNNING": 1, "ACCELERATING": 2, "DECELERATING": 3},
     "che": {"FORWARD": 1, "REVERSE": 2, "STANDBY": 3, "FAULT": 4},
@@ -168,9 +165,7 @@ STATUS = {  # metadata of status registers, as in the documents of these familie
 
 
 def states(path: Path, rows: list[Row]) -> Recording:
-    """Return a recording of three drives. On two of them `status` is an enumeration, each with other names;
-    on the third it is a set of bits.
-    """
+    """Return a recording of three drives; `status` is an enumeration of two of them, and a set of bits."""
     meanings: dict[str, Any] = {
         name: {"unit": "", "values": names, "bits": False} for name, names in STATUS.items()
     }
@@ -270,9 +265,6 @@ def test_state_lanes_that_do_not_fit_into_a_panel_are_counted(tmp_path: Path) ->
     assert len(axes.get_yticklabels()) == MOST_LANES
     assert axes.get_yticklabels()[0].get_text() == "yd0 b0"
     assert "(16 more lanes: choose with --drive)" in axes.get_title(loc="left")
-
-
-# ---- limits ----
 
 
 def test_a_plot_counts_drives_that_do_not_fit_and_tables_list_them(tmp_path: Path) -> None:

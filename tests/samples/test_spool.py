@@ -101,9 +101,6 @@ def test_a_spool_in_a_new_folder_has_a_new_log_id(tmp_path: Path) -> None:
     assert len(logs) == 2
 
 
-# ---- power cuts ----
-
-
 @pytest.mark.long
 @pytest.mark.parametrize("step", first_in_ci(83, 1))
 def test_if_the_newest_file_is_cut_at_any_byte_no_earlier_message_is_lost(
@@ -216,9 +213,6 @@ def test_a_killed_process_loses_no_row_that_it_reported(folder: Path, kills: int
         assert len(numbers) >= count
     assert min(told) > 0
     assert not list(folder.glob("*.damaged"))
-
-
-# ---- limits ----
 
 
 def test_a_full_spool_removes_its_oldest_messages(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -366,9 +360,6 @@ def test_rows_counted_as_lost_are_not_written(
         until(lambda: spool.state().lost == 300)
     store(spool, 30, 30)
     assert exchanges_in(rows_in(folder)) == list(range(30, 60))
-
-
-# ---- mistakes ----
 
 
 def test_a_second_process_cannot_open_the_same_spool(spool: Spool, folder: Path) -> None:

@@ -269,9 +269,6 @@ async def _until(met: Callable[[], bool]) -> None:
         await asyncio.sleep(0.01)
 
 
-# ---- real gateways ----
-
-
 @pytest.fixture(scope="module")
 def drill(tmp_path_factory: pytest.TempPathFactory) -> Iterator[CommandDrill]:
     with command_drill(tmp_path_factory.mktemp("drill"), 4) as found:

@@ -93,10 +93,7 @@ def test_a_late_confirmation_sends_nothing(desk: Desks, seconds: float, outcome:
 
 
 def do_after(desk: Desks, deed: Callable[[], object], waited_s: float = 0.0) -> CommandAnswer:
-    """Let `waited_s` pass, then confirm an offer.
-
-    The command's thread calls `deed` before it sends the command.
-    """
+    """Confirm an offer after `waited_s`. The command's thread calls `deed` before it sends the command."""
     token = desk.offered()
     offer = desk.desk.offers.find(token)
     work = offer.prepared.work
@@ -297,11 +294,8 @@ LOSSES: dict[str, Callable[[Desks], object]] = {
 
 @patient
 @pytest.mark.parametrize("loss", LOSSES)
-def test_a_lost_lines_stop_is_not_answered(desk: Desks, monkeypatch: pytest.MonkeyPatch, loss: str) -> None:
-    """The line's next master gets a copy of the stop, and answers it.
-
-    If this gateway is the master again later, it answers the next copy.
-    """
+def test_a_stop_of_a_lost_line_has_no_answer(desk: Desks, monkeypatch: pytest.MonkeyPatch, loss: str) -> None:
+    """The line's next master gets a copy of the stop, and answers it."""
 
     def lost(seconds: float | None) -> dict[str, Stopped]:
         LOSSES[loss](desk)
@@ -490,7 +484,7 @@ def test_a_malformed_stop_is_carried_out(
         ({"id": "one", "drives": ["fan"]}, {"id": "one", "drives": ["pump"]}),
     ],
 )
-def test_another_id_makes_a_stop_new(desk: Desks, first: dict[str, Any], then: dict[str, Any]) -> None:
+def test_a_stop_with_a_new_id_is_a_new_stop(desk: Desks, first: dict[str, Any], then: dict[str, Any]) -> None:
     asyncio.run(desk.stop_by(json.dumps(first).encode()))
     before = len(desk.writes)
     asyncio.run(desk.stop_by(json.dumps(then).encode()))
@@ -614,11 +608,8 @@ def test_a_hanging_disk_or_port_does_not_block_the_gateways_exit(tmp_path: Path,
 
 
 @pytest.mark.slow
-def test_one_of_many_stops_of_a_silent_drive_repeats(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """The first stop is being repeated while eight more arrive.
-
-    All nine get the result of a repeated stop.
-    """
+def test_only_one_of_many_stops_is_repeated(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Eight stops arrive while the first is being repeated. All nine get the result of a repeated stop."""
     repeated: list[float | None] = []
 
     are_all_called = threading.Event()

@@ -38,10 +38,7 @@ class Said:
 
 
 class ScriptedPath:
-    """A fake server connection with a list of answers for each kind of request: "cmd", "do", "ask" or "stop".
-
-    The last answer of a list is repeated.
-    """
+    """A fake server connection with a list of answers for each kind of request; the last one repeats."""
 
     is_open = True
 
@@ -269,7 +266,7 @@ def test_a_stop_does_not_wait_for_a_hanging_server(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("others", [[NOBODY, NOBODY], [NOBODY, CUT], [LOST, NOBODY]])
-def test_a_stop_is_reported_as_not_sent_only_by_all_servers(tmp_path: Path, others: list[Given]) -> None:
+def test_a_stop_counts_as_not_sent_only_if_all_servers_say_so(tmp_path: Path, others: list[Given]) -> None:
     paths = [ScriptedPath(stop=[given]) for given in (NOBODY, *others)]
 
     async def stop_on_all(client: FleetCommands) -> CommandAnswer:

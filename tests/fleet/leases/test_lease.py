@@ -331,7 +331,7 @@ async def test_a_gateway_whose_name_is_in_use_waits_until_that_lease_expires() -
 
 
 async def test_no_session_starts_if_only_one_lease_record_is_free() -> None:
-    """Otherwise a waiting gateway of the same name would take one lease record after another."""
+    """A waiting gateway of the same name must not take one lease record after another."""
     trial, first = await begun()
     second = trial.lease()
     for _ in range(8):
@@ -375,7 +375,7 @@ async def test_a_starting_session_replaces_no_record_of_a_living_session() -> No
     assert not second.is_valid
 
 
-async def test_a_released_lock_file_proves_death(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_released_lock_proves_a_process_dead(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(leases, "machine_id", lambda: "this machine")
     trial = Trial()
     lock = LifeLock(tmp_path / "a.lock")
@@ -443,9 +443,6 @@ def test_no_boot_id_means_no_machine_id(empty: int, tmp_path: Path, monkeypatch:
     assert leases.machine_id() == ""
 
 
-# ---- observers ----
-
-
 async def test_an_observer_ends_a_dead_session_when_its_own_clock_shows_the_expiry() -> None:
     trial, _ = await begun()
     observer = trial.observer()
@@ -462,10 +459,7 @@ async def test_an_observer_ends_a_dead_session_when_its_own_clock_shows_the_expi
 
 @pytest.mark.parametrize("has_rival", [False, True])
 async def test_ending_a_dead_session_does_not_wait_for_a_bucket_without_a_leader(has_rival: bool) -> None:
-    """The server of the third lease record may have died with the gateway.
-
-    Another observer may end a second one.
-    """
+    """The server of the third lease record may have died with the gateway."""
     trial, _lease, observer = await watched()
     trial.pass_lease()
     await look(observer)
@@ -528,7 +522,7 @@ async def test_no_gateway_writes_the_end_of_its_own_expired_session() -> None:
 
 
 async def test_a_gateway_that_was_cut_off_does_not_end_sessions_immediately() -> None:
-    """Otherwise all gateways would end each other's sessions after an outage of the servers."""
+    """After an outage of the servers, gateways must not end each other's sessions."""
     trial, _lease, observer = await watched()
     trial.clock.pass_s(60)
     observer.restart_waits()
@@ -542,7 +536,7 @@ async def test_a_gateway_that_was_cut_off_does_not_end_sessions_immediately() ->
 
 
 async def test_a_session_that_is_over_stays_over_after_an_outage() -> None:
-    """Otherwise lines would be assigned to a dead gateway until its session is found to be over again."""
+    """No line may be assigned to a dead gateway after the outage."""
     trial, _lease, observer = await watched()
     trial.pass_lease()
     await look(observer)

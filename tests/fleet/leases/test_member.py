@@ -240,7 +240,7 @@ async def test_a_drained_gateway_releases_all_lines_and_claims_none(fleet: Clust
 
 @pytest.mark.slow
 @pytest.mark.long
-def test_only_a_draining_gateway_releases_lines(fleet: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_with_a_silent_server_only_a_drain_releases(fleet: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
     silent = Replica("n3", is_current=False, is_offline=True, active_ns=0)
 
     async def maimed(*_: object) -> Servers:
@@ -294,7 +294,7 @@ async def test_lines_are_added_changed_and_removed_with_the_plant(fleet: Cluster
 
 @pytest.mark.slow
 @pytest.mark.long
-async def test_an_incompatible_gateway_stops_claims(fleet: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_an_incompatible_gateway_blocks_claims(fleet: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
     """The incompatible gateway is alive at the start of this gateway, or joins the fleet later."""
     async with gateways(fleet, terms=LONG) as running, other_version(fleet, monkeypatch) as other:
         await other.begin()
@@ -355,10 +355,7 @@ async def test_no_line_moves_when_a_server_dies(fleet: Cluster) -> None:
 async def test_sessions_without_a_third_lease_record_are_given_up_one_after_another(
     fleet: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A session is weak if it has lost a lease record.
-
-    One more dead server would end all weak sessions at once.
-    """
+    """One more dead server would end all sessions with two lease records at once."""
     monkeypatch.setattr(member_module, "WEAK_NS", 3600 * SECOND)
 
     async def lose_a_path(member: Member) -> None:
@@ -487,10 +484,7 @@ def a_member() -> Member:
 
 
 def steps(wake: Callable[[Member], object]) -> list[float]:
-    """Return the times (s) of the state machine's steps, from the first one until 0.12 s later.
-
-    `wake` is called at 0.06 s.
-    """
+    """Return the times (s) of the state machine's steps in 0.12 s; `wake` is called at 0.06 s."""
 
     async def main() -> list[float]:
         loop = asyncio.get_running_loop()

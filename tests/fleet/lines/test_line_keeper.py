@@ -66,20 +66,15 @@ class Trial:
         await until(lambda: "hall" in self.keeper.polled and not self.keeper._tasks)
 
     async def is_polled(self) -> None:
-        """Let time pass until the line is polled."""
         while "hall" not in self.keeper.polled or self.keeper._at_work:
             await asyncio.sleep(0.001)
 
     async def is_at_rest(self) -> None:
-        """Let time pass until no task is in progress on the line."""
         while self.keeper._at_work:
             await asyncio.sleep(0.001)
 
     async def let_the_first_lag(self) -> None:
-        """Let a second pass, and renew two lease records.
-
-        The third has the same home server as the line's first bucket.
-        """
+        """Renew all lease records late but the one on the home server of the line's first bucket."""
         self.clock.pass_s(1.001)
         for path, name in enumerate(names.OWNERS):
             if name != self.buckets[0].name:
@@ -358,7 +353,7 @@ async def test_a_claim_fails_if_another_gateway_has_written_a_record_first() -> 
 
 
 async def test_a_late_claim_does_not_reopen_a_released_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Otherwise the line would be opened while the records of its release are being written."""
+    """The line must stay closed while the records of its release are being written."""
     monkeypatch.setattr(line_keeper, "SPARE_S", 0.0)
     trial = DeadTrial()
     await trial.claim_without_the_first()
@@ -437,10 +432,7 @@ async def test_a_line_that_cannot_be_closed_ends_the_gateway() -> None:
 
 
 async def test_a_failure_on_one_line_affects_only_that_line(caplog: pytest.LogCaptureFixture) -> None:
-    """The failure is an exception, as from a user's drive class.
-
-    It is logged, and the line is opened again later.
-    """
+    """The failure is an exception, as from a user's drive class."""
     trial = Trial()
     take, failures = trial.lines.take, [ZeroDivisionError("of a user's class")]
 

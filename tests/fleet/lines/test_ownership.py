@@ -195,10 +195,7 @@ FIRST_LINES = set(FIRST.values())
 
 
 class Releasing:
-    """A gateway's `Releases`, with fake servers.
-
-    `led` are the buckets with a leader, `maimed` the buckets with a silent server.
-    """
+    """A `Releases` with fake servers: `led` buckets have a leader, `maimed` ones have a silent server."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.led = set(names.OWNERS)
@@ -248,7 +245,7 @@ def test_servers_are_checked_only_while_lines_wait_for_release(monkeypatch: pyte
     assert trial.releases.due(FIRST_LINES) == set()
 
 
-def test_no_line_is_released_while_two_buckets_are_silent(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_line_is_released_while_two_buckets_have_a_silent_server(monkeypatch: pytest.MonkeyPatch) -> None:
     trial = Releasing(monkeypatch)
     trial.maimed = {"own_0", "own_1"}
     trial.releases.due(FIRST_LINES)

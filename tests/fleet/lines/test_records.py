@@ -73,7 +73,7 @@ def test_an_ownership_record_of_another_session_is_read_until_it_is_free(value: 
     assert not trial.asks()
 
 
-def test_records_of_a_line_that_this_gateway_owns_already_are_not_read() -> None:
+def test_ownership_records_of_own_lines_are_not_read() -> None:
     trial = Trial()
     trial.bucket.store("line", OTHER)
     trial.follower.want(["line"])

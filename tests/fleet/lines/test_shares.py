@@ -122,7 +122,7 @@ def test_a_gateway_that_rejoins_a_running_fleet_gets_its_share_immediately() -> 
 
 
 def test_at_a_cold_start_lines_are_assigned_once_no_more_gateways_join() -> None:
-    """Otherwise the first gateway would read all lines' records, and the second those of half the lines."""
+    """Assigned earlier, the first gateway would read all lines' records, and the second half of them."""
     trial = Trial()
     assert trial.shared_among("b") == set()
     trial.clock.pass_s(QUIET_NS / SECOND - 0.01)
@@ -274,8 +274,6 @@ def test_only_lines_that_fit_into_a_lease_record_are_reported() -> None:
         failed(unopened, f"line-{number}")
     assert 0 < sum(len(line) + 4 for line in unopened.named()) <= MOST_BYTES
 
-
-# ---- which gateway gets reported lines ----
 
 SIXTY = [f"line-{number}" for number in range(60)]
 SHARED = assign(SIXTY, ["a", "b", "c"])

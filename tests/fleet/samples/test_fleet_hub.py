@@ -71,10 +71,7 @@ async def say_all(path: ServerPath, first: int, end: int) -> None:
 
 
 class Memory:
-    """A sink that keeps its commits in memory.
-
-    In `fates`, "b" fails before and "a" after storing a commit.
-    """
+    """A sink in memory. In `fates`, "b" is a failure before a commit is stored, and "a" one after it."""
 
     def __init__(self, fates: str = "") -> None:
         self.commits: list[Commit] = []
@@ -243,9 +240,6 @@ async def test_the_hub_refuses_a_stream_that_has_lost_its_newest_messages(runnin
             await SampleHub(path, sink).run()
 
 
-# ---- Parquet ----
-
-
 def kept_in_files(path: ServerPath, folder: Path, place: int) -> Any:
     async def live() -> HubState:
         sink = ParquetSink(folder)
@@ -308,7 +302,7 @@ def commit_of(
 
 
 def test_a_parquet_file_is_synced_before_its_rename(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Otherwise a power cut could leave an incomplete file."""
+    """A power cut must not leave an incomplete file."""
     calls: list[str] = []
     really_synced, really_renamed = os.fsync, Path.replace
 
@@ -350,8 +344,6 @@ def test_the_hub_refuses_a_folder_that_it_cannot_write(tmp_path: Path) -> None:
     with pytest.raises(SinkError, match="cannot be written: Not a directory"):
         ParquetSink(tmp_path / "file")
 
-
-# ---- PostgreSQL ----
 
 SAMPLES = """select time_ns, uncertainty_us, drive, register, value, status,
 extract(epoch from time) * 1000000 from multidrop.samples order by time_ns, drive, register"""

@@ -99,10 +99,7 @@ def test_a_gateway_name_that_nats_subjects_do_not_allow_is_rejected(name: str) -
 
 
 class SwallowingPath:
-    """A server connection whose answer arrives just when the request is cancelled.
-
-    `asyncio.wait_for` may swallow that cancellation.
-    """
+    """A server connection whose answer arrives just when the request is cancelled."""
 
     async def request(self, *_: object, **__: object) -> Any:
         with suppress(asyncio.CancelledError):
@@ -196,10 +193,7 @@ async def test_lost_messages_or_answers_are_repeated(running: Cluster, tmp_path:
 
 
 async def test_the_forwarder_ignores_answers_of_servers(running: Cluster, tmp_path: Path) -> None:
-    """Any client may direct a server's answer to the subject of a gateway's samples.
-
-    It is not one of the gateway's messages.
-    """
+    """Any client may direct a server's answer to the subject of a gateway's samples."""
     spool = filled(tmp_path / "spool", 2)
     subject = subject_of("gateway-1", spool.log)
     answers = [{}, {"Nats-Stream": "KV_own_0", samples_stream.SEQUENCE: "99"}]
@@ -304,9 +298,6 @@ async def test_the_largest_message_is_stored_and_read_back(running: Cluster) -> 
             assert await publish(path, "samples.a.b", data, headers) == place
         assert await last_of(path, "samples.a.b") == (3, 7, digest_of(data))
         assert [one.data == data for one in await stored(path)] == [True] * 3
-
-
-# ---- mistakes ----
 
 
 @pytest.mark.slow
@@ -455,10 +446,7 @@ def settled(spool: Spool, most: int) -> SpoolState:
 
 @pytest.mark.long
 async def test_after_a_long_outage_each_row_is_stored_or_counted_as_lost(tmp_path: Path, most: int) -> None:
-    """The spool cannot hold all rows of the outage.
-
-    Each row is stored by the hub, or counted as lost by the spool.
-    """
+    """The spool cannot hold all rows of the outage."""
     require_module("duckdb")
     with cluster(tmp_path / "nats", 1) as servers:
 

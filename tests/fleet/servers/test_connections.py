@@ -56,10 +56,7 @@ class SlowPath:
 
 
 def answer(*paths: SlowPath) -> tuple[str, float]:
-    """Send one read; return which connection's answer was used, and after how many s.
-
-    No request may stay in flight.
-    """
+    """Send one read; return which connection's answer was used, and after how many s."""
 
     async def main() -> tuple[str, float]:
         found = await first_answer(paths, REQUEST, full())
@@ -201,10 +198,7 @@ def test_timely_answers_allow_more_repeated_reads() -> None:
 
 
 def test_enough_reads_can_be_repeated_until_servers_drop_a_dead_route() -> None:
-    """Servers need 3 s to notice a dead route.
-
-    A gateway then sends about 100 reads and loses a third.
-    """
+    """In the 3 s until servers notice a dead route, a gateway sends about 100 reads and loses a third."""
     paths, budget = [LatePath(0.01) for _ in range(3)], full()
     took = []
 
@@ -406,10 +400,7 @@ def test_a_leader_that_does_not_answer_delays_no_hand_over_of_other_buckets(serv
 
 @pytest.mark.parametrize("cut_after_s", [0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7])
 def test_raft_terms_are_newer_before_an_election_starts(cut_after_s: float, servers: Servers) -> None:
-    """A leader on the cut-off server does not answer.
-
-    Leaders on other servers report it as silent after 2 s.
-    """
+    """Leaders on other servers report the cut-off server as silent after 2 s."""
 
     async def main() -> None:
         keeping = asyncio.create_task(

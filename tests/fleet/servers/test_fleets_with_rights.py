@@ -69,7 +69,7 @@ def test_a_whole_fleet_works_with_the_rights_that_fleet_rights_writes(tmp_path: 
         fleet.servers.give_rights_to(GATEWAYS)
         fleet.servers.reload()
         fleet.start("gw-c")
-        until(lambda: bool(fleet.status()["gateways"].get("gw-c", {}).get("lines")), "its share")
+        until(lambda: bool(fleet.status()["gateways"].get("gw-c", {}).get("lines")), "gw-c has lines")
         fleet.wait_for_polling()
         taken = fleet.status("commander")["gateways"]
         assert {name: one["session"] for name, one in taken.items()} == dict.fromkeys(GATEWAYS, 1)
@@ -84,7 +84,7 @@ def test_a_whole_fleet_works_with_the_rights_that_fleet_rights_writes(tmp_path: 
         check_that_a_stop_reports_its_progress(fleet)
         assert "drive-line-0" in "".join(path.read_text() for path in tmp_path.glob("gw-*/commands.jsonl"))
         fleet.kill("gw-a")
-        until(lambda: "gw-a" not in fleet.status()["gateways"], "its end")
+        until(lambda: "gw-a" not in fleet.status()["gateways"], "gw-a has left")
         fleet.wait_for_polling()
         drained = multidrop(fleet.servers, "operator", "fleet", "drain", "gw-b")
         assert (drained.returncode, drained.stderr) == (0, "")
@@ -106,8 +106,8 @@ def test_a_gateway_with_a_revoked_key_logs_it_and_others_take_its_lines(tmp_path
     with secured_fleet(tmp_path, 1, ("gw-a", "gw-b")) as fleet:
         fleet.wait_for_polling()
         fleet.servers.give_rights_to(["gw-b"])
-        until(lambda: "refuses these credentials" in fleet.log("gw-a"), "the sentence")
-        until(lambda: "all lines are closed" in fleet.log("gw-a"), "silence")
+        until(lambda: "refuses these credentials" in fleet.log("gw-a"), "gw-a logs it")
+        until(lambda: "all lines are closed" in fleet.log("gw-a"), "gw-a closes its lines")
         fleet.wait_for_polling()
         assert fleet.running["gw-a"].poll() is None  # the gateway continues to run, and retries
         # the refusal is logged once per connection, not at each attempt
@@ -134,7 +134,7 @@ def test_a_thief_with_a_gateways_key_can_only_interrupt_polling(tmp_path: Path) 
         fleet.servers.give_rights_to(GATEWAYS)
         fleet.servers.reload()
         fleet.wait_for_polling()
-        until(lambda: len(fleet.status()["gateways"]) == 2, "both")
+        until(lambda: len(fleet.status()["gateways"]) == 2, "both gateways have joined")
 
         def session(name: str) -> int:
             return int(fleet.status()["gateways"].get(name, {"session": 0})["session"])
@@ -157,36 +157,39 @@ def test_clocks_an_hour_apart_are_logged_and_harmless(tmp_path: Path) -> None:
     (tmp_path / "ahead" / "sitecustomize.py").write_text(AN_HOUR_AHEAD)
     ahead = {"gw-a": {"PYTHONPATH": str(tmp_path / "ahead")}, "gw-b": {}}
     with secured_fleet(tmp_path, 1, ("gw-a", "gw-b"), ahead) as fleet:
-        until(lambda: "this machine's clock is 3600 s ahead of that of tls://" in fleet.log("gw-a"), "a word")
+        until(
+            lambda: "this machine's clock is 3600 s ahead of that of tls://" in fleet.log("gw-a"),
+            "gw-a logs it",
+        )
 
         def are_two() -> bool:
             return [bool(one["lines"]) for one in fleet.status()["gateways"].values()] == [True, True]
 
-        until(are_two, "both")
+        until(are_two, "both gateways have lines")
         for name in ("gw-b", "gw-a"):
             fleet.kill(name)
-            until(lambda name=name: name not in fleet.status()["gateways"], "its end")
+            until(lambda name=name: name not in fleet.status()["gateways"], "it has left")
             fleet.wait_for_polling()
             if name == "gw-b":
                 fleet.start(name)
-                until(are_two, "both")
+                until(are_two, "both gateways have lines")
         assert "this machine's clock" not in fleet.log("gw-b")
         assert fleet.hall.overlaps() == 0
 
 
 def test_a_second_gateway_of_the_same_name_waits_until_the_first_one_ends(tmp_path: Path) -> None:
-    """The second gateway has another folder, as on another machine.
-
-    It waits for the first one, then takes over.
-    """
+    """The second gateway has another folder, as on another machine."""
     with secured_fleet(tmp_path, 1, ("gw-a",)) as fleet:
         fleet.wait_for_polling()
         fleet.start("gw-a", "second")
         sentence = "gw-a polls no lines yet: a gateway called gw-a runs on"
-        until(lambda: sentence in fleet.log("second"), "the sentence")
+        until(lambda: sentence in fleet.log("second"), "it logs that it waits")
         assert fleet.status()["gateways"]["gw-a"]["session"] == 1
         fleet.kill("gw-a")
-        until(lambda: fleet.status()["gateways"].get("gw-a", {}).get("session") == 2, "the second one")
+        until(
+            lambda: fleet.status()["gateways"].get("gw-a", {}).get("session") == 2,
+            "the second gateway takes over",
+        )
         fleet.wait_for_polling()
         assert fleet.log("second").count(sentence) == 1
         assert fleet.hall.overlaps() == 0

@@ -197,7 +197,7 @@ def test_mistaken_credentials_are_reported_in_one_sentence(
 @pytest.mark.long
 @pytest.mark.slow
 def test_no_data_is_sent_to_a_server_without_tls(run: Run, servers: SecuredCluster, tmp_path: Path) -> None:
-    """Otherwise an attacker between client and server could read and relay the login."""
+    """An attacker between client and server could read and relay the login."""
     with cluster(tmp_path / "plain", 1) as plain:
         url = plain.urls[0].replace("nats://", "tls://")
         key, ca = str(servers.key("viewer")), str(servers.tls.ca)
@@ -250,10 +250,7 @@ STREAMS = ("KV_plant", "KV_lease_0", "KV_own_0", STREAM)
 
 
 def elsewhere(user: str, inboxes: Mapping[str, str]) -> list[str]:
-    """Return subjects of other users, to which `user` may ask servers to send answers.
-
-    Each subject contains the name of `user`.
-    """
+    """Return subjects of other users, to which `user` may ask servers to send answers."""
     return [
         *(f"$KV.plant.{user}", f"$KV.lease_0.{user}.gw-b", f"$KV.own_0.{user}", f"{STREAM}.gw-b.{user}"),
         *(f"stop.{user}", f"cmd.{user}", f"do.gw-b.{user}", f"gateway.gw-b.{user}"),
@@ -262,7 +259,6 @@ def elsewhere(user: str, inboxes: Mapping[str, str]) -> list[str]:
 
 
 async def make_streams(servers: SecuredCluster) -> None:
-    """Create a fleet's buckets and its stream of samples."""
     operator = paths_of(servers.urls, servers.options("operator"))
     await set_up(operator)
     await create_stream(operator[0], replicas=len(servers.nodes))
@@ -295,7 +291,6 @@ def questions(user: str) -> Iterator[tuple[str, bytes]]:
 
 
 def all_inboxes(servers: SecuredCluster) -> dict[str, str]:
-    """Return the prefix of each user's inboxes."""
     public = {user: public_key(servers.key(user).read_text().strip()) for user in (*TWO_GATEWAYS, *OTHERS)}
     return {user: inbox_of(key) for user, key in public.items()}
 
@@ -324,7 +319,7 @@ async def arrivals(servers: SecuredCluster, wanted: Set[str]) -> set[str]:
 
 
 async def arrivals_at(servers: SecuredCluster, url: str, wanted: Set[str]) -> set[str]:
-    """Do what `arrivals` does at one server, and return the subjects that got an answer."""
+    """Make the requests of `arrivals` at one server; return the subjects that got an answer."""
     heard: set[str] = set()
 
     async def hear(message: Msg) -> None:
@@ -352,7 +347,6 @@ async def arrivals_at(servers: SecuredCluster, url: str, wanted: Set[str]) -> se
 
 
 async def stored(client: Client, stream: str) -> set[str]:
-    """Return all subjects in a stream."""
     answer = await client.request(f"$JS.API.STREAM.INFO.{stream}", b'{"subjects_filter": ">"}', ANSWERS_S)
     return set(json.loads(answer.data)["state"].get("subjects", ()))
 

@@ -113,10 +113,7 @@ def test_init_refuses_servers_that_ignore_a_writer(nats: Cluster, monkeypatch: p
 def test_init_repeats_an_unanswered_removal_of_its_test_bucket(
     is_carried_out: bool, nats: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """`init` removes the bucket in which it has tested concurrent writes.
-
-    A busy leader may answer too late.
-    """
+    """`init` removes the bucket of its test. A busy leader may answer too late."""
     removals = []
 
     async def ask_in_vain(path: ServerPath, subject: str, data: Any = None) -> dict[str, Any]:
@@ -136,7 +133,7 @@ def test_init_repeats_an_unanswered_removal_of_its_test_bucket(
 @pytest.mark.long
 @pytest.mark.slow
 def test_init_needs_all_servers_only_when_it_creates_buckets(tmp_path: Path) -> None:
-    """Otherwise a bucket would be stored on two servers, and the failure of either would end all polling."""
+    """A bucket stored on only two servers would fail with either of them."""
     with cluster(tmp_path, 3) as three:
         down = next(node for node in three.nodes if not node.leads_servers())
         others = [node for node in three.nodes if node is not down]

@@ -49,9 +49,6 @@ def clocked(tmp_path: Path) -> Iterator[Clocked]:
     made.spool.close()
 
 
-# ---- positions ----
-
-
 def test_newest_message_is_sent_before_the_backlog() -> None:
     position, sent = SpoolPosition(3), []
     for newest in (9, 9, 9, *[12] * 6):
@@ -75,9 +72,6 @@ def test_each_message_is_sent_once_although_the_receiver_fails_at_random() -> No
             assert len(position.gaps) <= MOST_GAPS
         assert sorted(sent) == list(range(1, 301))
         assert position == SpoolPosition(300)
-
-
-# ---- outages ----
 
 
 @pytest.mark.slow
@@ -145,9 +139,6 @@ def test_sent_messages_that_a_full_spool_deletes_do_not_count_as_lost(tmp_path: 
     clocked.spool.close()
 
 
-# ---- restarts ----
-
-
 def test_a_restarted_forwarder_continues_after_the_last_sent_message(tmp_path: Path) -> None:
     first = Clocked(tmp_path / "spool")
     for number in range(3):
@@ -200,9 +191,6 @@ def test_a_position_file_beyond_the_newest_spooled_message_is_reported(tmp_path:
     clocked.spool.close()
     assert "which ends at message 1: the folder was copied or set back" in clocked.forwarder.problem
     assert clocked.receiver.messages == []
-
-
-# ---- receivers ----
 
 
 def test_a_refused_message_is_skipped_if_the_receiver_accepts_other_messages(clocked: Clocked) -> None:

@@ -98,7 +98,7 @@ from multidrop.samples import SpoolState, unpack
         ('[serve.mqtt]\nrows = true\nmost = "1"', "[serve.mqtt]: most = invalid size '1': write 1 kB or"),
     ],
 )
-def test_each_forwarding_mistake_is_one_sentence(tmp_path: Path, serve: str, mistake: str) -> None:
+def test_a_forwarding_mistake_is_reported_in_one_sentence(tmp_path: Path, serve: str, mistake: str) -> None:
     with pytest.raises(PlantError) as wrong:
         read_settings(written(tmp_path, serve), {})
     [found] = wrong.value.mistakes
@@ -239,9 +239,6 @@ def test_a_hanging_stdout_blocks_no_other_thread(tmp_path: Path, monkeypatch: py
     part._spool.close()
     assert not was_sent
     assert not was_blocked
-
-
-# ---- a plant that changes ----
 
 
 def plant_with(unit: str, folder: Path) -> Plant:

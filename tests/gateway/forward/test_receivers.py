@@ -271,9 +271,6 @@ def test_influx_keeps_special_characters_of_names_and_stores_a_repeated_row_once
     ]
 
 
-# ---- run InfluxDB 1 on a port of its own, and query it ----
-
-
 PATIENCE_S = 30.0
 CONFIG = """
 reporting-disabled = true

@@ -68,10 +68,7 @@ def hub(tmp_path: Path, clock: HubClock) -> Hub:
 
 
 def rows(*found: tuple[int, int, int | Status], drive: str = "pump-1", utc_0: int = UTC_0) -> Batch:
-    """Return rows of a drive.
-
-    Each is given as (time in periods, register, raw count or status of a failed read).
-    """
+    """Return rows of a drive, given as (time in periods, register, raw count or status of a failed read)."""
     columns = Columns(len(found))
     for at, register, said in found:
         layout = RowLayout(DRIVES.index(drive), [Field(0, NumberFormat.U16, register, 1.0, 1.0)])
@@ -444,7 +441,7 @@ def test_only_scaled_values_have_a_unit(model: str) -> None:
             assert (register["at_least"], register["at_most"]) == (known.at_least, known.at_most)
 
 
-def test_the_common_register_block_has_no_number_for_values_of_unknown_scale() -> None:
+def test_the_common_block_has_no_number_for_values_of_unknown_scale() -> None:
     delixi, che = DelixiModbus(1, name="fan"), InvtCHE(2, name="pump", maximum_frequency=50)
     names = ("output_frequency", "output_current")
     drives = [polled(drive, [drive.registers[name] for name in names]) for drive in (delixi, che)]

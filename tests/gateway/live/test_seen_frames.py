@@ -37,10 +37,7 @@ WRITE = {"drive": "pump-1", "register": "setpoint", "value": 50.0}
 
 
 class Times:
-    """A SeenFrames under test.
-
-    The test sets its clock, `now_ns`, and the time of each drive's last stop, `stopped`.
-    """
+    """A SeenFrames with a clock and with times of the drives' last stops, which the test sets."""
 
     def __init__(self) -> None:
         self.now_ns = 10**12
@@ -111,9 +108,6 @@ def test_old_page_frames_are_forgotten(times: Times) -> None:
     assert len(times.frames._made) == len(times.frames._came) == 26
 
 
-# ---- through the gateway ----
-
-
 @pytest.fixture(scope="module")
 def gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     with served(tmp_path_factory.mktemp("frames"), MAY) as found:
@@ -167,21 +161,17 @@ def test_a_delayed_command_is_not_sent(tmp_path: Path, path: str, body: dict[str
 
 def test_a_stop_is_sent_however_long_the_network_delayed_it(tmp_path: Path) -> None:
     with served(tmp_path, MAY) as gateway:
-        assert gateway.command("/api/write", WRITE, authorization=gateway.bearer(Right.WRITE)).json["done"]
-        assert gateway.command("/api/act", START, authorization=gateway.bearer(Right.WRITE)).json["done"]
-        motor = gateway.sims["pump-1"].motor  # type: ignore[attr-defined]
-        assert motor.goal
+        gateway.start("pump-1")
         with held_up(gateway, "/api/stop", {"drives": None}) as client:
             pass_time(gateway, 10 * MOST_AGE_NS)
             assert "seen to stand" in answer(client)
-        assert not motor.goal
+        assert gateway.stands("pump-1")
 
 
 def test_a_start_with_a_page_frame_from_before_a_stop_is_not_sent(tmp_path: Path) -> None:
-    """Otherwise a proxy that repeats or delays a start could start a motor after a stop."""
-    writer = {}
+    """A proxy that repeats or delays a start must not start a motor after a stop."""
     with served(tmp_path, MAY) as gateway:
-        writer["authorization"] = gateway.bearer(Right.WRITE)
+        writer = gateway.writer
         seen = gateway.frame_number()
         start = {**START, "seen": seen}
         assert gateway.post("/api/write", {**WRITE, "seen": seen}, **writer).json["done"] is True
@@ -195,7 +185,7 @@ def test_a_start_with_a_page_frame_from_before_a_stop_is_not_sent(tmp_path: Path
             f"pump-1.start was not sent: a stop was called after frame {seen}: check and confirm again"
         )
         assert commands(gateway) == sent
-        assert gateway.command("/api/act", START, **writer).json["done"] is True
+        assert gateway.act("pump-1", "start")["done"] is True
 
 
 def test_a_command_that_waited_too_long_for_its_thread_is_not_sent(tmp_path: Path) -> None:
@@ -228,7 +218,7 @@ def test_a_stop_right_before_a_start_prevents_it(gateway: Served, monkeypatch: p
         return act(drive, **given)
 
     monkeypatch.setattr(commands_module, "carry_out_verb", act_after_a_stop)
-    told = gateway.command("/api/act", START, authorization=gateway.bearer(Right.WRITE)).json
+    told = gateway.act("pump-1", "start")
     assert (told["done"], "start was not sent" in told["text"]) == (False, True)
     assert commands(gateway) == before
 
@@ -240,7 +230,7 @@ def test_a_page_frame_number_of_a_previous_process_is_refused(tmp_path: Path) ->
     with served(tmp_path, MAY) as gateway:
         assert gateway.frame_number() != seen
         body = {**START, "seen": seen}
-        told = gateway.post("/api/act", body, authorization=gateway.bearer(Right.WRITE)).json
+        told = gateway.post("/api/act", body, **gateway.writer).json
         assert (told["done"], "is not from the last 5 s" in told["text"]) == (False, True)
         assert commands(gateway) == []
 
@@ -248,11 +238,10 @@ def test_a_page_frame_number_of_a_previous_process_is_refused(tmp_path: Path) ->
 @table("wrong", [{}, {"seen": None}, {"seen": "7"}, {"seen": True}, {"seen": 1.5}, {"seen": 10**300}])
 def test_commands_without_a_frame_number_are_refused(gateway: Served, wrong: dict[str, Any]) -> None:
     before, called = commands(gateway), gateway.gateway.commands.called
-    writer = {"authorization": gateway.bearer(Right.WRITE)}
     verbs = {"start": {}, "jog": {}, "reset_fault": {}, "set_frequency": {"hz": 20.0}}
     acts = [{"drive": "pump-1", "verb": verb, "options": options} for verb, options in verbs.items()]
     for path, body in (("/api/write", WRITE), *(("/api/act", act) for act in acts)):
-        found = gateway.post(path, {**body, **wrong}, **writer)
+        found = gateway.post(path, {**body, **wrong}, **gateway.writer)
         assert (found.status, found.json["error"].partition(" or")[0]) == (400, "seen is missing")
     assert (commands(gateway), gateway.gateway.commands.called) == (before, called)
 
@@ -270,7 +259,7 @@ def test_the_start_command_in_the_documentation_works_from_a_shell(tmp_path: Pat
     page = (Path(__file__).parents[3] / "docs/gateway/serve.md").read_text("utf-8")
     block = next(text for text in re.findall(r"```sh\n(.*?)```", page, re.DOTALL) if "jq" in text)
     with served(tmp_path, MAY) as gateway:
-        assert gateway.command("/api/write", WRITE, authorization=gateway.bearer(Right.WRITE)).json["done"]
+        assert gateway.write("pump-1", "setpoint", 50.0)["done"]
         login = f"authorization: {gateway.bearer(Right.WRITE)}\ncontent-type: application/json\n"
         (tmp_path / "login").write_text(login)
         script = block.replace("localhost:8750", f"localhost:{gateway.gateway.port}")

@@ -27,8 +27,6 @@ from multidrop.gateway.modbus_server.settings import ModbusSettings
 
 UNREAD = 150_000  # so many requests that their answers do not fit into the socket buffers of both sides
 
-# ---- connections ----
-
 
 class FakeTransport(asyncio.Transport):
     """A transport that stores the bytes written to it."""
@@ -205,7 +203,9 @@ async def test_writes_start_on_arrival_and_in_their_order(is_stalled: bool) -> N
 
 
 @pytest.mark.parametrize("frames", [reads, writes])
-async def test_a_turn_of_slow_answers_ends_early(frames: Callable[[int, int], bytes]) -> None:
+async def test_slow_answers_to_a_client_are_sent_in_several_turns(
+    frames: Callable[[int, int], bytes],
+) -> None:
     client, transport = connected(port_of(slowly))
     client.data_received(frames(0, 100))
     assert len(transactions(transport.written)) < 10
@@ -327,9 +327,6 @@ async def test_a_client_that_closed_its_sending_side_still_gets_its_answers() ->
     assert transactions(transport.written) == [5]
     assert transport.ended == "closed"
     assert connected(port_of())[0].eof_received() is False
-
-
-# ---- over real sockets ----
 
 
 def test_invalid_bytes_of_one_client_do_not_affect_another() -> None:
@@ -504,10 +501,7 @@ def test_a_client_that_reads_its_answers_late_gets_all_of_them(gateway: Gateway)
 
 
 class PacedLine:
-    """A line on which each request takes `seconds`.
-
-    It records start times and how many requests overlapped.
-    """
+    """A line on which each request takes `seconds`; it records start times and overlaps of requests."""
 
     def __init__(self, seconds: float) -> None:
         self.seconds = seconds
@@ -546,7 +540,7 @@ async def flood(share: LineShare, line: PacedLine, seconds: float, clients: int 
 
 @pytest.mark.long
 @pytest.mark.parametrize("seconds", usually(0.03, 0.005, 0.7))
-async def test_a_flooding_client_gets_exactly_a_fifth_of_the_line_s_time(seconds: float) -> None:
+async def test_a_flooding_client_gets_exactly_a_fifth_of_the_line_time(seconds: float) -> None:
     loop = asyncio.get_running_loop()
     begun = loop.time()
     share, line = LineShare(), PacedLine(seconds)

@@ -77,9 +77,6 @@ def code(gateway: Gateway, unit: int, function: int, *words: int, data: bytes = 
         return client.ask(unit, function, *words, data=data).code
 
 
-# ---- reads ----
-
-
 def test_a_polled_value_is_answered_without_a_request_on_the_line(gateway: Gateway) -> None:
     with gateway.client() as client:
         assert client.ask(1, 3, CHE_OUTPUT_VOLTAGE, 1).words == [231]
@@ -211,8 +208,6 @@ def test_a_broadcast_closes_the_connection_and_is_not_passed_on(gateway: Gateway
     assert (gateway.line.asked, gateway.commands.written, gateway.commands.stopped) == ([], [], [])
 
 
-# ---- failures of reads passed to the drive ----
-
 FAILURES = [
     (NoReply("mill"), 0x0B),
     (BadReply("mill", "wrong checksum", b"\1"), 0x0B),
@@ -246,9 +241,6 @@ def test_reads_beyond_the_clients_share_of_line_time_are_answered_busy(gateway: 
     codes = {reply.transaction: reply.code for reply in replies if reply is not None}
     assert codes == {0: None, **dict.fromkeys(range(1, 12), 6)}
     assert len(gateway.line.asked) == 1  # No line time is left for 2 s, so the other reads expire.
-
-
-# ---- writes ----
 
 
 def test_a_write_is_carried_out_by_the_gateways_commands_and_echoed(gateway: Gateway) -> None:
@@ -375,9 +367,6 @@ def test_clients_with_the_right_to_stop_can_only_stop() -> None:
         assert code(gateway, 1, 6, CHE_CONTROL, 5) is None
         assert gateway.commands.stopped == [(["mill"], Caller("anyone", "modbus", "127.0.0.1", Right.STOP))]
         assert gateway.commands.written == []
-
-
-# ---- stops ----
 
 
 @table("value", [v for v in range(20) if v not in (5, 6, 8)])
@@ -524,9 +513,6 @@ def test_a_reply_of_a_wrong_length_is_no_reply(gateway: Gateway, monkeypatch: py
     assert code(gateway, 1, 3, CHE_OUTPUT_VOLTAGE, 2) == 0x0B
 
 
-# ---- the common block ----
-
-
 def block(gateway: Gateway, unit: int = 1, function: int = 3) -> list[int]:
     with gateway.client() as client:
         return client.ask(unit, function, BLOCK, 11).words
@@ -593,9 +579,6 @@ def test_drives_of_every_family_have_the_common_register_block(gateway: Gateway)
     for unit, drive in enumerate(("mill", "meter", "pump", "belt"), 1):
         gateway.hub.states[drive] = "runs"
         assert block(gateway, unit)[0] == 2
-
-
-# ---- ports of lines, and a plant that changes ----
 
 
 def test_a_line_with_its_own_tcp_port_is_served_there() -> None:

@@ -147,7 +147,7 @@ def test_mistakes_in_the_table_serve_modbus_are_reported_with_their_place(tmp_pa
         ({"common": 0xFFF8}, "is not an address"),
     ],
 )
-def test_each_modbus_setting_mistake_is_one_sentence(settings: dict[str, object], sentence: str) -> None:
+def test_each_mistaken_modbus_setting_is_reported(settings: dict[str, object], sentence: str) -> None:
     with pytest.raises(ValueError, match=r"^[\w\"]+") as mistake:
         ModbusSettings(**settings)  # type: ignore[arg-type]
     assert sentence in str(mistake.value)
@@ -321,9 +321,6 @@ def test_no_family_has_registers_in_the_address_range_of_the_common_register_blo
     for family in families:
         unit = Unit("hall", PolledDrive(family(family.addresses[0]), ()))
         assert not unit.holding_addresses() & common
-
-
-# ---- units ----
 
 
 @table(

@@ -118,9 +118,6 @@ def code(tool: int, body: str) -> int | None:
     return reply[2] if reply[1] & 0x80 else None
 
 
-# ---- reads ----
-
-
 def test_a_read_by_each_modbus_function_gets_the_drives_reply(rig: Rig, tool: int) -> None:
     assert ask(tool, "01 03 00 10 00 02") == bytes.fromhex("01 03 04 0010 0011")
     assert ask(tool, "01 04 70 00 00 01") == bytes.fromhex("01 04 02 7000")  # undeclared
@@ -271,9 +268,6 @@ def test_serial_settings_of_a_modbus_tool_have_no_effect_and_echo_is_turned_off(
     assert len(rig.commands.written) == 1
 
 
-# ---- writes ----
-
-
 def test_a_port_for_modbus_tools_refuses_and_records_each_write_by_default(tmp_path: Path) -> None:
     with serving(tmp_path) as rig, opened(str(rig.link)) as tool:
         for body in (
@@ -340,9 +334,6 @@ def test_a_failed_write_is_answered_with_an_exception_or_not_at_all(rig: Rig) ->
             else:
                 assert code(tool, f"01 06 {SETPOINT:04X} 1388") == answer
     assert [(drive, why) for drive, _, why in rig.commands.refused] == [("mill", "no")]
-
-
-# ---- connections ----
 
 
 def test_hostile_bytes_from_a_modbus_tool_do_not_affect_the_next_tool(rig: Rig, tool: int) -> None:
@@ -428,7 +419,7 @@ def test_a_symlink_is_replaced_only_if_a_killed_gateway_made_it(tmp_path: Path) 
         ('pty = { hall = "p" }\nbaud = 9600', "baud"),
     ],
 )
-def test_each_tool_port_mistake_is_one_sentence(text: str, sentence: str, tmp_path: Path) -> None:
+def test_each_mistaken_tool_port_setting_is_reported(text: str, sentence: str, tmp_path: Path) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(f"[serve.tool]\n{text}\n" + LINES)
     with pytest.raises(PlantError) as wrong:

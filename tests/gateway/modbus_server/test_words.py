@@ -1,7 +1,4 @@
-"""Words computed from polled values equal the drive's words bit for bit, or are unknown.
-
-The core decodes random bytes into values, and the words computed from these values must equal the bytes.
-"""
+"""Words computed from polled values equal the drive's words bit for bit, or are unknown."""
 
 from __future__ import annotations
 
@@ -159,9 +156,6 @@ def test_no_words_are_computed_for_a_register_with_a_scale_register() -> None:
     )
     assert exact_data(family.registers["level"], 5.0) is None
     assert exact_data(family.registers["power"], -2.0) == b"\xff\xfe"
-
-
-# ---- ranges ----
 
 
 class Status(IntEnum):

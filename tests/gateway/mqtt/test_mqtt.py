@@ -198,9 +198,6 @@ def test_a_restarted_broker_gets_all_messages(broker: Broker, listener: Listener
     again.close()
 
 
-# ---- commands ----
-
-
 @pytest.fixture
 def commanded(listener: Listener, start: Start) -> Any:
     """The context of an MQTT part that is online and carries out commands."""
@@ -478,9 +475,6 @@ async def test_commands_are_ignored_unless_enabled(tmp_path: Path, is_retained: 
     assert known.commands.noted == []
 
 
-# ---- Home Assistant ----
-
-
 def test_home_assistant_discovers_each_drive(broker: Broker, listener: Listener, start: Start) -> None:
     start(home_assistant=True, commands=True, every="2 s")
     said = listener.wait_for(has("homeassistant/device/multidrop-pump-1/config"))
@@ -590,10 +584,7 @@ def test_components_of_each_family_have_valid_home_assistant_keys(model: str) ->
 
 
 class Awkward(Drive):
-    """A user's drive class.
-
-    Its registers have the names of Home Assistant components that the gateway adds.
-    """
+    """A user's drive class whose registers have the names of Home Assistant components of the gateway."""
 
     title = "ACME A-1"
     running = reading(1, "Hz")
@@ -656,9 +647,6 @@ def test_the_home_assistant_stop_button_is_available_while_its_drive_is_silent()
 def test_home_assistant_ids_of_two_gateways_differ() -> None:
     names = [("a-b", "c"), ("a", "b-c"), ("a_2d_b", "c"), ("a", "b_c"), ("a", "b c")]
     assert len({discovery_topic(*one) for one in names}) == len(names)
-
-
-# ---- settings ----
 
 
 def test_all_mistakes_in_the_mqtt_settings_are_reported(tmp_path: Path) -> None:
@@ -724,9 +712,6 @@ def test_drives_cannot_have_the_fixed_words_of_topics_as_names(tmp_path: Path) -
     assert ours <= RESERVED_NAMES.keys()
 
 
-# ---- figures ----
-
-
 @pytest.mark.slow
 def test_metrics_count_sent_mqtt_messages(broker: Broker, tmp_path: Path) -> None:
     require_module("paho.mqtt.client")
@@ -756,9 +741,6 @@ def test_mqtt_metrics_have_help_texts(broker: Broker, tmp_path: Path) -> None:
         for word in ("replaced", "no connection", "not acknowledged"):
             assert word in told["mqtt_dropped_total"]
         assert "one more for Sparkplug" in told["mqtt_connected"]
-
-
-# ---- another plant ----
 
 
 class PutMessages:

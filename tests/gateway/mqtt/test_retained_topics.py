@@ -18,7 +18,6 @@ from peers import require_module, require_program
 from tables import table
 
 from multidrop.control import CommandOutcome, CommandResult
-from multidrop.gateway.http.rights import Right
 from multidrop.gateway.mqtt.home_assistant import discovery_topic
 from multidrop.gateway.mqtt.json_topics import (
     MOST_DISCOVERY,
@@ -112,9 +111,6 @@ def test_number_of_retained_messages_that_are_examined_is_limited() -> None:
     assert len([*left_behind.hear(*GATEWAY, THERE), *left_behind.hear(*drives[-1], THERE)]) == 2
 
 
-# ---- through a broker ----
-
-
 def kept_at(broker: Broker) -> set[str]:
     """Return the topics for which the broker has a retained message."""
     listener = Listener(broker)
@@ -195,9 +191,7 @@ def test_a_start_that_a_broker_delivers_after_a_stop_is_refused(tmp_path: Path) 
         motor = gateway.sims["pump-1"].motor  # type: ignore[attr-defined]
         try:
             listener.wait_for(lambda one: one.topic == "multidrop/gateway" and one.payload == b"online")
-            value = {"drive": "pump-1", "register": "setpoint", "value": 50.0}
-            writer = {"authorization": gateway.bearer(Right.WRITE)}
-            assert gateway.command("/api/write", value, **writer).json["done"] is True
+            assert gateway.write("pump-1", "setpoint", 50.0)["done"] is True
             start()
             assert told() == "pump-1: start is done"
             until(lambda: motor.goal)

@@ -152,7 +152,7 @@ def test_a_client_that_sends_a_message_without_end_is_disconnected(gateway: Serv
             peer.sendall(bytes(1 << 26))
 
 
-def test_a_client_that_reads_nothing_is_closed(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_client_that_reads_nothing_is_refused(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(server, "MOST_UNREAD", 1 << 16)
     with recorded(port_of(gateway)) as (url, sent), Client(url, timeout=PATIENCE) as client:
         client.read_values([client.get_node("ns=2;s=pump-1.State")] * 500)
@@ -220,9 +220,6 @@ def test_an_opc_ua_request_for_too_many_nodes_is_refused(gateway: Served) -> Non
             client.read_values([state] * (server.MOST_OPERATIONS + 1))
 
 
-# ---- encryption ----
-
-
 def make_certificate(folder: Path, name: str) -> None:
     subprocess.run(
         [
@@ -236,7 +233,7 @@ def make_certificate(folder: Path, name: str) -> None:
     )
 
 
-def test_a_certificate_allows_only_encryption(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_with_a_certificate_sessions_are_encrypted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("plant", "client"):
         make_certificate(tmp_path, name)
     files = 'certificate = "plant.pem"\nkey = "plant-key.pem"\n'

@@ -98,27 +98,10 @@ def names_of(nodes: Any) -> list[str]:
     return [node.read_browse_name().Name for node in nodes]
 
 
-def start(gateway: Served, *drives: str) -> None:
-    writer = {"authorization": gateway.bearer(Right.WRITE)}
-    for drive in drives:
-        value = {"drive": drive, "register": "setpoint", "value": 50.0}
-        verb = {"drive": drive, "verb": "start", "options": {}}
-        for path, body in (("/api/write", value), ("/api/act", verb)):
-            assert gateway.command(path, body, **writer).json["done"] is True
-        assert not stands(gateway, drive)
-
-
-def stands(gateway: Served, drive: str) -> bool:
-    return not gateway.sims[drive].motor.goal  # type: ignore[attr-defined]
-
-
 def stop(client: Any, drive: str = "") -> str:
     """Call the stop of a drive, or of all drives; return the text of the answer."""
     place, method = (f"ns=2;s={drive}", f"ns=2;s={drive}.Stop") if drive else (PLANT, PLANT_STOP)
     return str(client.get_node(place).call_method(client.get_node(method).nodeid))
-
-
-# ---- closing ----
 
 
 @pytest.mark.slow
@@ -151,10 +134,7 @@ async def test_a_server_closed_while_starting_accepts_no_client(monkeypatch: pyt
 
 @pytest.mark.slow
 async def test_closing_the_last_server_resets_python_settings(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The nodes are freed without a garbage collection.
-
-    During the first run, another server is registered.
-    """
+    """The nodes are freed without a garbage collection."""
     serving, switch_s = {object()}, sys.getswitchinterval()
     monkeypatch.setattr("multidrop.gateway.opcua.part._unended", serving)
     context: Any = SimpleNamespace(plant=Plant(()), version="1", hub=SimpleNamespace(drives=[]))
@@ -192,9 +172,6 @@ def test_opc_ua_nodes_are_excluded_from_garbage_collection(gateway: Served) -> N
     assert gc.isenabled()
     assert gc.get_freeze_count() > 400_000
     assert sys.getswitchinterval() == pytest.approx(SWITCH_S)
-
-
-# ---- reading ----
 
 
 @pytest.mark.slow
@@ -251,42 +228,36 @@ def test_opc_ua_clients_cannot_write_values(client: Any) -> None:
         client.get_node(PLANT).add_object(2, "intruder")
 
 
-# ---- stops ----
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("drive", "drives"), [("pump-1", ["pump-1"]), ("", ["pump-1", "pump-2"])])
 def test_the_stop_method_stops_motors(gateway: Served, client: Any, drive: str, drives: list[str]) -> None:
-    start(gateway, *drives)
+    gateway.start(*drives)
     assert "stop" in stop(client, drive)
-    until(lambda: all(stands(gateway, one) for one in drives))
+    until(lambda: all(gateway.stands(one) for one in drives))
     until(lambda: all(read(client, f"{one}.State").Value.Value == "stands" for one in drives))
 
 
 @pytest.mark.slow
-def test_a_stop_method_of_another_drive_is_sent_but_not_confirmed(gateway: Served, client: Any) -> None:
-    start(gateway, "pump-1", "pump-2")
-    with pytest.raises(ua.UaStatusCodeError, match="BadMethodInvalid"):
-        client.get_node("ns=2;s=pump-2").call_method(client.get_node("ns=2;s=pump-1.Stop").nodeid)
-    until(lambda: stands(gateway, "pump-1"))
-    assert not stands(gateway, "pump-2")
-    assert "stop" in stop(client, "")
-
-
-@pytest.mark.slow
-def test_a_stop_on_another_drives_object_is_not_confirmed_during_many_stops(
+def test_a_stop_method_of_another_drive_is_sent_but_not_confirmed(
     gateway: Served, client: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    gateway.start("pump-1", "pump-2")
+    other, stop_1 = client.get_node("ns=2;s=pump-2"), client.get_node("ns=2;s=pump-1.Stop").nodeid
+    with pytest.raises(ua.UaStatusCodeError, match="BadMethodInvalid"):
+        other.call_method(stop_1)
+    until(lambda: gateway.stands("pump-1"))
+    assert not gateway.stands("pump-2")
+    assert "stop" in stop(client, "")
     # With the limit 0, the server answers as if the limit of concurrent stops were reached.
     monkeypatch.setattr("multidrop.gateway.opcua.part.MOST_STOPS", 0)
     with pytest.raises(ua.UaStatusCodeError, match="BadMethodInvalid"):
-        client.get_node("ns=2;s=pump-2").call_method(client.get_node("ns=2;s=pump-1.Stop").nodeid)
+        other.call_method(stop_1)
     assert stop(client, "pump-1") == "the stop is in progress"
 
 
 @pytest.mark.slow
 def test_stops_in_one_opc_ua_request_do_not_wait_for_each_other(gateway: Served, client: Any) -> None:
-    start(gateway, "pump-1")
+    gateway.start("pump-1")
     gateway.sims["pump-2"].deaf_until = float("inf")
     try:
         calls = [
@@ -297,7 +268,7 @@ def test_stops_in_one_opc_ua_request_do_not_wait_for_each_other(gateway: Served,
         found = client.tloop.post(session.call(calls))
         assert found[0].StatusCode.name == "GoodCompletesAsynchronously"
         assert found[0].OutputArguments[0].Value == "the stop is in progress"
-        assert stands(gateway, "pump-1")
+        assert gateway.stands("pump-1")
     finally:
         gateway.sims["pump-2"].deaf_until = 0.0
     until(lambda: not gateway.gateway.bus("hall").stops_under_way())
@@ -306,7 +277,7 @@ def test_stops_in_one_opc_ua_request_do_not_wait_for_each_other(gateway: Served,
 @pytest.mark.slow
 def test_an_opc_ua_client_that_reads_nothing_delays_no_poll_and_no_stop(gateway: Served, client: Any) -> None:
     words = [sys.executable, str(SUBSCRIBER), url_of(gateway), "50"]
-    start(gateway, "pump-1", "pump-2")
+    gateway.start("pump-1", "pump-2")
     with BoundProcess(words, stdout=subprocess.PIPE, text=True) as subscriber:
         try:
             assert subscriber.stdout is not None
@@ -315,13 +286,10 @@ def test_an_opc_ua_client_that_reads_nothing_delays_no_poll_and_no_stop(gateway:
             rows = gateway.gateway.hub.taken
             until(lambda: gateway.gateway.hub.taken > rows + 20)
             assert "stop" in stop(client, "pump-1")
-            until(lambda: stands(gateway, "pump-1"))
+            until(lambda: gateway.stands("pump-1"))
             assert gateway.post("/api/stop").json["pump-2"]["done"] is True
         finally:
             subscriber.kill()
-
-
-# ---- rights ----
 
 
 @pytest.mark.slow
@@ -343,9 +311,6 @@ def test_opc_ua_clients_have_the_rights_of_their_tokens(tmp_path: Path) -> None:
             gateway.gateway.commands.may = gateway.gateway.commands.may._replace(look="token")
             with pytest.raises(ua.UaStatusCodeError, match="BadUserAccessDenied"):
                 read(stopper, "pump-1.State")
-
-
-# ---- reload ----
 
 
 @pytest.mark.slow
@@ -437,9 +402,6 @@ def test_opc_ua_accepts_only_clients_on_this_computer_by_default(tmp_path: Path)
     assert settings.parts["opcua"] == OpcUaSettings("127.0.0.1:4840")
 
 
-# ---- status codes and units of OPC UA ----
-
-
 GOOD_ROW, MISS = (5, 50, 24.5, 0), (7, 70, 0.0, 1)
 NAMES = {  # names of OPC UA status codes (OPC 10000-6, A.2, StatusCode.csv)
     0x00000000: "Good",
@@ -491,7 +453,7 @@ def test_each_row_has_the_expected_opc_ua_status_code(
         (hub.Shown(hub.SILENT, "no reply"), ("Bad_NoCommunication", None)),
     ],
 )
-def test_no_fault_is_shown_only_if_it_is_proved(shown: hub.Shown, expected: tuple[str, str | None]) -> None:
+def test_the_status_no_fault_needs_proving_values(shown: hub.Shown, expected: tuple[str, str | None]) -> None:
     code, text = fault_of(shown)
     assert (NAMES[code], text) == expected
 

@@ -207,10 +207,7 @@ def lines() -> dict[str, Any]:
 
 
 def fleet(began: float) -> dict[str, Any]:
-    """Return the answer to `GET /api/fleet`: twelve lines and three gateways.
-
-    One gateway has just died. Some times are more than a day ago, so that the page shows their dates.
-    """
+    """Return the answer to `GET /api/fleet`: twelve lines and three gateways, one of which has just died."""
     at = int(began * 1000)
     spool = {"bytes": 81_234_567, "lost": 0, "behind": 2, "lag_s": 1.4, "trouble": None}
     says = {"state": "working", "margin_s": 2.14, "troubles": {}, "trouble": "", "spool": spool}

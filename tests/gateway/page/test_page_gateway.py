@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import re
-import signal
-import subprocess
-import sys
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -15,7 +10,7 @@ import pytest
 from fake_gateway import FakeGateway
 from gateways import served
 from lines import until as until_here
-from watching import LIVE, STALE, Opener, cell, press_enter, until, until_met
+from watching import LIVE, Opener, cell, press_enter, until, until_met
 
 from multidrop.gateway.http.rights import Right
 
@@ -43,28 +38,6 @@ def test_the_web_page_shows_a_polled_plant_and_stops_it_with_a_token(page: Any, 
         page.evaluate("location.hash = '#/drives'")
         page.evaluate("location.hash = '#/log'")
         page.locator("#log-list tbody tr").first.wait_for()
-
-
-def test_a_killed_gateway_is_reported(page: Any) -> None:
-    command = [sys.executable, "-m", "multidrop", "serve", "--demo", "--no-browser"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
-    try:
-        assert process.stdout is not None
-        url = next(found[0] for line in process.stdout if (found := re.search(r"http://\S+", line)))
-        page.goto(url)
-        until(page, LIVE)
-        assert page.locator("tr.drive").count() == 17
-        tasks = Path(f"/proc/{process.pid}/task").glob("*/children")
-        simulators = " ".join(task.read_text() for task in tasks).split()
-        process.send_signal(signal.SIGKILL)
-        for simulator in simulators:
-            os.kill(int(simulator), signal.SIGTERM)
-        until(page, STALE)
-        assert "cannot be reached" in page.locator("#notice").inner_text()
-    finally:
-        process.kill()
-        process.wait()
-        process.stdout.close()
 
 
 def test_the_delay_of_values_over_a_network_of_8_kb_a_second_does_not_grow(page: Any, tmp_path: Path) -> None:

@@ -34,12 +34,12 @@ def test_the_web_page_shows_live_values_of_all_drives(opened: Opener, gateway: F
 
 def test_a_killed_gateway_is_reported(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/drives/pump-1")
-    gateway.kill()
+    with page.expect_event("requestfailed", lambda request: request.url.endswith("/api/plant")):
+        gateway.kill()
     until(page, STALE)
     assert re.fullmatch(r"\d+ s old", link(page))
-    notice = page.locator("#notice").inner_text()
-    assert "cannot be reached" in notice
-    assert re.search(r"The values shown are from (\d+ \w+, )?\d\d:\d\d:\d\d UTC\.", notice)
+    notice = r"The gateway cannot be reached\. The values shown are from (\d+ \w+, )?\d\d:\d\d:\d\d UTC\."
+    assert re.fullmatch(notice, page.locator("#notice").inner_text())
     until_met(page, lambda: page.locator(FRESH).count() == 0)
     shown = cell(page, "pump-1", "frequency").inner_text().replace("\n", "")
     assert re.search(r"^\d+\.\d+Hz\d+(\.\d)? s old$", shown)
@@ -219,9 +219,6 @@ def test_times_are_shown_with_24_hours_in_utc_or_local_time_as_chosen(opened: Op
     page.reload()
     # the choice survives a reload of the page
     until(page, "document.querySelector('#clock').textContent.endsWith('local')")
-
-
-# ---- while the page is loaded ----
 
 
 FORBIDDEN = """for (const name of ['sessionStorage', 'localStorage'])

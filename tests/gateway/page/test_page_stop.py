@@ -322,10 +322,7 @@ def test_a_refused_stop_is_shown_as_not_sent(opened: Opener, gateway: FakeGatewa
 def test_eight_tabs_with_six_connections_show_live_values_and_can_stop_drives(
     browser: Any, gateway: FakeGateway, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A browser allows six connections to a host, for all its tabs together.
-
-    The stop is sent while no new page frame is made, so the requests of other tabs hold all six.
-    """
+    """A browser allows six connections to a host. The requests of other tabs hold all six."""
     # so long that a stop which waits for these requests would fail the test
     monkeypatch.setattr(fake_gateway, "HOLD_S", 2 * PATIENCE_S)
     gateway.clocked = "pump-1"  # the frequency of this drive is the time
@@ -351,7 +348,7 @@ def test_eight_tabs_with_six_connections_show_live_values_and_can_stop_drives(
 
 
 @pytest.mark.parametrize("case", ["a write that wants a token", "a reload"])
-def test_a_later_dialog_does_not_replace_a_stops(opened: Opener, gateway: FakeGateway, case: str) -> None:
+def test_a_late_dialog_does_not_replace_a_stops_own(opened: Opener, gateway: FakeGateway, case: str) -> None:
     """The answer to an earlier request arrives while the question is open."""
     path = "api/reload" if case == "a reload" else "api/write"
     held: list[Any] = []
@@ -424,7 +421,7 @@ def test_the_stop_key_works_behind_a_dialog_but_not_in_a_text_field(opened: Open
 
 
 @pytest.mark.parametrize("verb", ["stop", "emergency stop"])
-def test_the_page_waits_longer_than_stops_repeat(opened: Opener, gateway: FakeGateway, verb: str) -> None:
+def test_the_page_waits_longer_than_a_stop_repeats(opened: Opener, gateway: FakeGateway, verb: str) -> None:
     """With one dead drive, the page could otherwise never show which drives have stopped."""
     page = opened("#/drives/pump-1")
     page.evaluate("""() => {

@@ -59,7 +59,7 @@ def test_the_filter_hides_lines_without_matches(opened: Opener) -> None:
     assert page.locator("#table tbody tr:visible").count() == 0
 
 
-def test_lines_of_a_large_plant_are_folded_without_problems(opened: Opener, gateway: FakeGateway) -> None:
+def test_in_a_large_plant_lines_without_problems_are_folded(opened: Opener, gateway: FakeGateway) -> None:
     lines = [line_of_one(n, 50) for n in range(2)]
     for n, line in enumerate(lines):
         line["drives"] = [line["drives"][0] | {"name": f"fan-{n}-{i}"} for i in range(40)]
@@ -449,7 +449,7 @@ def test_time_before_the_start_is_not_shown_as_free_of_faults(opened: Opener, ga
     assert all(abs(part - 0.5) < 0.02 for part in lanes.evaluate_all(part))
 
 
-def test_another_unit_has_its_own_plot_and_more_are_listed(opened: Opener, gateway: FakeGateway) -> None:
+def test_a_second_unit_has_its_own_plot_and_others_are_listed(opened: Opener, gateway: FakeGateway) -> None:
     gateway.recorded = {
         "pump-1.output_current": {"unit": "%", "left_out": ["A", ""]},
         "pump-2.output_current": {"unit": "A", "left_out": []},

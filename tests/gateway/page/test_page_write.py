@@ -210,31 +210,24 @@ def test_a_command_names_the_frame_shown_at_its_confirmation(opened: Opener, gat
     assert before <= gateway.seen[0] <= page.evaluate(newest)
 
 
-def test_a_stop_during_the_dialog_of_a_start_prevents_it(opened: Opener, gateway: FakeGateway) -> None:
-    page = opened("#/drives/pump-1")
-    page.get_by_role("button", name="start").click()
-    gateway.stops = {"pump-1": 1}
-    until(page, "import('/page/data/store.js').then(m => m.stops('pump-1') === 1)")
-    page.get_by_role("button", name="start pump-1").click()
-    page.locator("#outcomes li").wait_for()
-    said = page.locator("#outcomes").inner_text()
-    assert "start: not sent. The drive was stopped in the meantime." in said
-    assert gateway.posts == []
-    page.get_by_role("button", name="start", exact=True).click()
-    page.get_by_role("button", name="start pump-1").click()
-    until_met(page, lambda: gateway.posts)
-
-
-def test_a_reload_during_the_dialog_of_a_start_prevents_it(opened: Opener, gateway: FakeGateway) -> None:
-    """After the reload, the name in the dialog may mean another drive."""
+@pytest.mark.parametrize("event", ["a stop", "a reload"])
+def test_a_stop_or_reload_during_the_dialog_of_a_start_prevents_it(
+    opened: Opener, gateway: FakeGateway, event: str
+) -> None:
+    """After a reload, the name in the dialog may mean another drive."""
     page = opened("#/drives/pump-1")
     page.get_by_role("button", name="start", exact=True).click()
-    gateway.changes = gateway.plant_changes = {"revision": 2}
-    until(page, "import('/page/data/store.js').then(m => m.store.plant.revision === 2)")
+    if event == "a stop":
+        gateway.stops = {"pump-1": 1}
+        until(page, "import('/page/data/store.js').then(m => m.stops('pump-1') === 1)")
+    else:
+        gateway.changes = gateway.plant_changes = {"revision": 2}
+        until(page, "import('/page/data/store.js').then(m => m.store.plant.revision === 2)")
     page.get_by_role("button", name="start pump-1").click()
     page.locator("#outcomes li").wait_for()
+    why = "drive was stopped" if event == "a stop" else "plant file was reloaded"
     said = page.locator("#outcomes").inner_text()
-    assert "start: not sent. The plant file was reloaded in the meantime." in said
+    assert f"start: not sent. The {why} in the meantime." in said
     assert gateway.posts == []
     page.get_by_role("button", name="start", exact=True).click()
     page.get_by_role("button", name="start pump-1").click()

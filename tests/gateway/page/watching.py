@@ -61,10 +61,7 @@ POLLED = """new Promise((done, fail) => {
 
 
 def until(page: Any, expression: str) -> None:
-    """Wait until this JavaScript expression is true.
-
-    The page may reload meanwhile. Raises AssertionError after PATIENCE_S.
-    """
+    """Wait until this JavaScript expression is true; the page may reload meanwhile."""
 
     def met() -> object:
         try:
@@ -157,9 +154,6 @@ def link(page: Any) -> str:
 
 
 def violations(page: Any, *without: str) -> list[str]:
-    """Return the violations that axe-core finds in the open view, except for the rules in `without`.
-
-    The page must have loaded axe-core.
-    """
+    """Return the violations that axe-core finds in the open view; `without` are rules to skip."""
     found = page.evaluate(RUN_AXE, [AXE_TAGS, without])
     return [f"{v['id']}: {node['target']} {node['failureSummary']}" for v in found for node in v["nodes"]]

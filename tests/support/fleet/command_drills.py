@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import json
 import random
-import signal
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -110,8 +109,6 @@ class CommandDrill(FleetProcesses):
         super().__init__(folder, nats, "\n".join([*lines, f"[fleet.may]\nwrite = [{listed}]\n"]))
         self.start(*GATEWAYS)
 
-    # ---- writes that the drives received ----
-
     def setpoints(self, drive: str) -> Counter[int]:
         return Counter(one.raw for one in list(self.sims[drive].counters.writes) if one.name == "frequency")
 
@@ -121,8 +118,6 @@ class CommandDrill(FleetProcesses):
     def written_s(self, drive: str, raw: int) -> float:
         writes = list(self.sims[drive].counters.writes)
         return next(one.time for one in writes if (one.name, one.raw) == ("frequency", raw))
-
-    # ---- clients ----
 
     async def ask(self, commands: int, seconds: float, seed: int = 1, *, is_attacked: bool = True) -> Verdict:
         """Send `commands` commands in `seconds` s while processes are attacked; return the verdict."""
@@ -198,8 +193,6 @@ class CommandDrill(FleetProcesses):
         ways = Counter(one.way for one in asked)
         return Verdict(told, ways, deeds, twice, wrongly, unknown_sent, unnoted, oldest)
 
-    # ---- attacks ----
-
     async def _attack(self, dice: random.Random, *, is_attacked: bool) -> Counter[str]:
         done: Counter[str] = Counter()
         deeds: dict[str, Callable[[random.Random], object]] = {
@@ -226,10 +219,8 @@ class CommandDrill(FleetProcesses):
 
     def _stop_gateway(self, dice: random.Random) -> None:
         """Suspend a gateway for a random time; if that exceeds its lease, the kernel kills it."""
-        victim = self.gateways[dice.choice(GATEWAYS)]
-        victim.send_signal(signal.SIGSTOP)
-        time.sleep(dice.choice((dice.uniform(0.05, 1.5), dice.uniform(0.5, 3.5))))
-        victim.send_signal(signal.SIGCONT)
+        seconds = dice.choice((dice.uniform(0.05, 1.5), dice.uniform(0.5, 3.5)))
+        self.suspend(dice.choice(GATEWAYS), seconds)
 
     def _kill_node(self, dice: random.Random) -> None:
         victim = dice.choice(self.nats.nodes)
@@ -238,10 +229,7 @@ class CommandDrill(FleetProcesses):
         victim.start()
 
     def _stop_node(self, dice: random.Random) -> None:
-        victim = dice.choice(self.nats.nodes)
-        victim.pause()
-        time.sleep(dice.uniform(0.1, 2.0))
-        victim.go_on()
+        self.suspend_node(dice.choice(self.nats.nodes), dice.uniform(0.1, 2.0))
 
 
 @contextmanager

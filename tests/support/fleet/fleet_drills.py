@@ -37,8 +37,6 @@ SOON_S = 2.0  # s for which lines are watched if `settle` follows, which waits f
 
 
 class CommandEnd(NamedTuple):
-    """The exit status and the output of a command."""
-
     returncode: int
     stdout: str
     stderr: str
@@ -76,7 +74,6 @@ class FleetProcesses:
         assert made.returncode == 0, made.stderr
 
     def run(self, *words: str) -> CommandEnd:
-        """Run `multidrop fleet` with these arguments."""
         return run_here(self._environment, "fleet", *words)
 
     def status(self) -> dict[str, Any]:
@@ -99,15 +96,25 @@ class FleetProcesses:
         self.gateways[name].kill()
         self.gateways[name].wait()
 
+    def suspend(self, name: str, seconds: float) -> subprocess.Popen[str]:
+        """Suspend a gateway for `seconds`; return its process, which the kernel may have killed."""
+        running = self.gateways[name]
+        running.send_signal(signal.SIGSTOP)
+        time.sleep(seconds)
+        running.send_signal(signal.SIGCONT)
+        return running
+
+    def suspend_node(self, node: Node, seconds: float) -> None:
+        node.pause()
+        time.sleep(seconds)
+        node.go_on()
+
     def close(self) -> None:
         kill_all(self.gateways.values())
 
 
 class FleetDrill(FleetProcesses):
-    """A fleet drill: its rounds attack a fleet.
-
-    Each round measures the longest time without requests on each line.
-    """
+    """Rounds of attacks on a fleet; each measures the longest time without requests on each line."""
 
     def __init__(
         self,
@@ -175,7 +182,7 @@ class FleetDrill(FleetProcesses):
         return time.monotonic() - begun
 
     def judge(self, deed: Callable[[], object], seconds: float = JUDGED_S) -> dict[str, float]:
-        """Perform the action; return each line's longest gap (s) without requests in the next `seconds`."""
+        """Call `deed`; return each line's longest gap (s) without requests in the next `seconds`."""
         self.hall.reset()
         deed()
         killed = [name for name in GATEWAYS if self.gateways[name].poll() is not None]
@@ -187,8 +194,6 @@ class FleetDrill(FleetProcesses):
 
         self.wait(are_polled, "all lines are polled again")
         return self.hall.gaps()
-
-    # ---- actions ----
 
     def do_nothing(self) -> None:
         """Do nothing, to measure the gaps between requests that are usual on this machine."""
@@ -206,17 +211,10 @@ class FleetDrill(FleetProcesses):
 
     def stop_gateway(self) -> subprocess.Popen[str]:
         """Suspend a gateway for longer than its lease, so the kernel kills it; return its process."""
-        running = self.gateways[self.random.choice(GATEWAYS)]
-        running.send_signal(signal.SIGSTOP)
-        time.sleep(self.random.uniform(3.5, 6.0))
-        running.send_signal(signal.SIGCONT)
-        return running
+        return self.suspend(self.random.choice(GATEWAYS), self.random.uniform(3.5, 6.0))
 
     def stop_gateway_shortly(self) -> None:
-        running = self.gateways[self.random.choice(GATEWAYS)]
-        running.send_signal(signal.SIGSTOP)
-        time.sleep(self.random.uniform(0.2, 3.2))
-        running.send_signal(signal.SIGCONT)
+        self.suspend(self.random.choice(GATEWAYS), self.random.uniform(0.2, 3.2))
 
     def kill_node(self) -> None:
         self.random.choice(self.nats.nodes).kill()
@@ -226,10 +224,7 @@ class FleetDrill(FleetProcesses):
         asyncio.run(_end_record(self.nats, self.random.choice(GATEWAYS), self.random.choice(names.LEASES)))
 
     def stop_node(self) -> None:
-        node = self.random.choice(self.nats.nodes)
-        node.pause()
-        time.sleep(self.random.uniform(1, 6))
-        node.go_on()
+        self.suspend_node(self.random.choice(self.nats.nodes), self.random.uniform(1, 6))
 
     def leader_alone(self, group: Sequence[str], others: Sequence[str]) -> Node:
         """Return a node that leads one bucket of `group`, and no bucket of `others`."""
@@ -249,10 +244,7 @@ class FleetDrill(FleetProcesses):
         self.leader_alone(group, others).kill()
 
     def stop_leader(self, group: Sequence[str], others: Sequence[str]) -> None:
-        node = self.leader_alone(group, others)
-        node.pause()
-        time.sleep(self.random.uniform(1, 6))
-        node.go_on()
+        self.suspend_node(self.leader_alone(group, others), self.random.uniform(1, 6))
 
     def kill_all_nodes(self) -> None:
         for node in self.nats.nodes:
@@ -322,8 +314,6 @@ def drilled(folder: Path, lines: int = 12, seed: int = 1) -> Iterator[FleetDrill
     with cluster(folder / "nats") as nats, closing(FleetDrill(folder, nats, lines, seed)) as drill:
         yield drill
 
-
-# ---- the state that `multidrop fleet status` prints ----
 
 LOOK_S = 0.25  # s between queries; one query uses as much CPU as a gateway does in seconds
 

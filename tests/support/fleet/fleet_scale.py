@@ -76,13 +76,11 @@ class MemberProcess:
 
 
 def cpu_s_of(pid: int) -> float:
-    """Return the CPU time (s) that a process has used."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def until(condition: Callable[[], bool], what: str) -> None:
-    """Wait until the condition holds; fail with the text `what` after PATIENCE_S."""
     ends = time.monotonic() + PATIENCE_S
     while not condition():
         assert time.monotonic() < ends, what
@@ -151,7 +149,6 @@ class LargeFleet:
 
 
 def plant_of_fake_lines(lines: int) -> dict[str, Any]:
-    """Return a plant of this many fake lines."""
     return {f"line-{at}": {"line": {"name": f"line-{at}"}, "files": {}} for at in range(lines)}
 
 
@@ -191,7 +188,7 @@ class NoLines:
 
 
 class NoMastership:
-    """A fake mastership that raises the same errors as the engine."""
+    """A fake of the engine's right to send, which raises the same errors."""
 
     def extend(self, until_ns: int) -> None:
         if until_ns <= boottime_ns():

@@ -141,7 +141,7 @@ class GatedBucket(MemoryBucket):
 
 
 class RecordingMastership:
-    """Replaces the engine's mastership: records the deadline and the calls, and raises the same errors."""
+    """A fake of the engine's right to send: it records deadlines and calls, and raises the same errors."""
 
     def __init__(self, clock: Callable[[], int]) -> None:
         self.clock = clock
@@ -195,7 +195,7 @@ class RecordingLines:
 
 
 class Hall:
-    """All gateways of a fake fleet; records claims of lines on which another gateway may still send."""
+    """All gateways of a fake fleet; it records claims of lines on which another gateway may still send."""
 
     def __init__(self) -> None:
         self.gateways: list[RecordingLines] = []

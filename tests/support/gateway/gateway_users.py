@@ -110,8 +110,6 @@ class Users:
                 self.fail(f"{user.__name__.strip('_')}: {type(failure).__name__}: {failure}"[:200])
             await asyncio.sleep(ROUND_S)
 
-    # ---- HTTP ----
-
     async def _viewer(self) -> None:
         """Receive frames as fast as possible and check their numbers."""
         reader, writer = await asyncio.open_connection("127.0.0.1", self.place.http)
@@ -176,10 +174,7 @@ class Users:
                 due = max(due + every, time.monotonic())
                 await asyncio.sleep(max(0.0, due - time.monotonic()))
 
-    # ---- Modbus TCP ----
-
     async def _cached_master(self) -> None:
-        """Read the polled registers of each drive in turn, as a Modbus master."""
         await self._master(lambda turn: (self.place.first, WORDS), "reads")
 
     async def _uncached_master(self) -> None:
@@ -225,9 +220,6 @@ async def _get(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, path:
     body = await reader.readexactly(int(length[1])) if length else b""
     status = int(head.split()[1])
     return status, gzip.decompress(body) if "content-encoding: gzip" in head else body
-
-
-# ---- the users' process ----
 
 
 class GatewayUsers:

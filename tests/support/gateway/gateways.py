@@ -42,8 +42,6 @@ POLL = '["status", "output_frequency", "output_current", "fault"]'
 
 
 class Answer(NamedTuple):
-    """An HTTP response."""
-
     status: int
     headers: Mapping[str, str]
     body: bytes
@@ -71,7 +69,6 @@ class Served:
 
     @property
     def loop(self) -> asyncio.AbstractEventLoop:
-        """The gateway's event loop."""
         assert self._loop is not None
         return self._loop
 
@@ -100,10 +97,33 @@ class Served:
         """Send a write or a verb, with the number of the newest frame as a page does."""
         return self.post(path, {**body, "seen": self.frame_number()}, **headers)
 
+    @property
+    def writer(self) -> dict[str, str]:
+        """The headers of a caller with the right to write."""
+        return {"authorization": self.bearer(Right.WRITE)}
+
+    def write(self, drive: str, register: str, value: object) -> Any:
+        """Write a value with the right to write; return the JSON of the answer."""
+        body = {"drive": drive, "register": register, "value": value}
+        return self.command("/api/write", body, **self.writer).json
+
+    def act(self, drive: str, verb: str, **options: object) -> Any:
+        """Carry out a verb with the right to write; return the JSON of the answer."""
+        body = {"drive": drive, "verb": verb, "options": options}
+        return self.command("/api/act", body, **self.writer).json
+
+    def start(self, *drives: str) -> None:
+        for drive in drives:
+            assert self.write(drive, "setpoint", 50.0)["done"] is True
+            assert self.act(drive, "start")["text"] == f"{drive}: start is done"
+            assert not self.stands(drive)
+
+    def stands(self, drive: str) -> bool:
+        return not self.sims[drive].motor.goal  # type: ignore[attr-defined]
+
     def frame_number(self) -> int:
         """Wait for a new frame; return its number."""
-        writer = {"authorization": self.bearer(Right.WRITE)}
-        self._seen = int(self.get(f"/api/frame?after={self._seen}", **writer).json["n"])
+        self._seen = int(self.get(f"/api/frame?after={self._seen}", **self.writer).json["n"])
         return self._seen
 
     def bearer(self, right: Right) -> str:
@@ -118,7 +138,6 @@ class Served:
 
 
 def certificate(folder: Path, name: str) -> None:
-    """Create a certificate and its key with openssl."""
     subprocess.run(
         [
             *("openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1"),
@@ -235,9 +254,6 @@ def _running(gateway: Gateway) -> Iterator[asyncio.AbstractEventLoop]:
         assert not thread.is_alive()
     if failures:
         raise failures[0]
-
-
-# ---- the command `multidrop serve` ----
 
 
 @contextmanager

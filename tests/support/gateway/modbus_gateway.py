@@ -110,10 +110,7 @@ class FakeLine:
 
 
 def plant_of(*drives: tuple[str, Drive], polled: bool = True) -> Plant:
-    """Return a plant that polls all readable registers of these drives, each given with its line's name.
-
-    The registers have no rates, because the server's calculation with rates would dominate a short test.
-    """
+    """Return a plant that polls all readable registers of these drives, each given with its line's name."""
     lines: dict[str, list[PolledDrive]] = {}
     for line, drive in drives:
         registers = [register for register in drive.registers.values() if register.readable and polled]
@@ -171,8 +168,6 @@ def in_thread(make: Callable[[], ModbusServer]) -> Iterator[ModbusServer]:
 
 
 class Gateway(NamedTuple):
-    """A running server with its fakes."""
-
     server: ModbusServer
     hub: FakeHub
     commands: FakeCommands
@@ -244,7 +239,6 @@ class RawClient:
             return None
 
     def ask(self, unit: int, function: int, *words: int, data: bytes = b"") -> RawReply:
-        """Send one request; return its reply."""
         self.send(request(7, unit, function, *words, data=data))
         reply = self.receive()
         assert reply is not None

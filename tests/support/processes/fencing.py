@@ -94,7 +94,7 @@ class Round:
 
 
 class Fence:
-    """Masters of several lines, one after another; each may send for `beyond` s after its lease expired."""
+    """Processes that poll several lines, one after another; each may send `beyond` s after its lease."""
 
     def __init__(
         self, lines: int, lease: float, guard: float, *, timer: float = 0.0, beyond: float = 0.0
@@ -152,10 +152,7 @@ class Fence:
         return True
 
     def stop_once(self, chance: random.Random) -> Round:
-        """Suspend a polling master at a random moment, take over, and let it continue; return the result.
-
-        If the kernel killed the master before its suspension, as on a busy machine, retry with another one.
-        """
+        """Suspend a polling master at a random moment, take over, and let it continue; return the result."""
         while True:
             with self._master() as master:
                 if self._is_polling(master):

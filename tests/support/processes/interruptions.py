@@ -50,17 +50,11 @@ def place(frame: FrameType) -> str:
     return f"{frame.f_code.co_qualname}, line {frame.f_lineno}, opcode {frame.f_lasti}"
 
 
-# ---- before each bytecode ----
-
-
 @contextmanager
 def calling_at(
     nth: int, counts: Callable[[FrameType], bool], call: Callable[[], object]
 ) -> Iterator[list[str]]:
-    """Call `call` before the nth opcode in frames for which `counts` is true; add its place to a list.
-
-    `counts` is called once per frame, because a call for each opcode would double the time of such a test.
-    """
+    """Call `call` before the nth opcode in frames for which `counts` is true; add its place to a list."""
     left, before = nth, sys.gettrace()
     found: list[str] = []
 

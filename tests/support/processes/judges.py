@@ -113,9 +113,6 @@ def _confirmed(request: Message, values: str) -> Message:
     return Message(request.address, request.function, request.start, request.count, data)
 
 
-# ---- the result that the standard requires of a server ----
-
-
 def expected(used: int, request: Message) -> Understood:
     """Return the result that the application protocol V1.1b3, section 6, requires for this request.
 
@@ -160,9 +157,6 @@ def _carry_out(request: Message, changes: dict[tuple[int, int], int]) -> bytes:
             changes[table, start + at] = after
     tail = request.data if function in ECHOES else count.to_bytes(2)
     return bytes([function]) + start.to_bytes(2) + tail
-
-
-# ---- pymodbus: its framers and messages ----
 
 
 class Pymodbus:
@@ -305,9 +299,6 @@ def data_bytes(function: int, count: int) -> int:
     return (count + 7) // 8 if function in BITS else 2 * count
 
 
-# ---- undamaged ----
-
-
 def random_request(chance: random.Random) -> Message:
     function = chance.choice(FUNCTIONS)
     is_broadcast = function in (0x05, 0x06, 0x0F, 0x10) and chance.random() < 0.05
@@ -365,8 +356,6 @@ def reply_body(reply: Message) -> Body:
     return head + reply.start.to_bytes(2) + reply.count.to_bytes(2)
 
 
-# ---- damaged with a correct checksum ----
-
 Change = Callable[[random.Random, Body], Body]
 
 
@@ -409,8 +398,6 @@ REPAIRED: dict[str, Change] = {
     "exception": lambda chance, body: bytes([body[0], body[1] | 0x80, chance.choice((0, 1, 2, 9, 0x20))]),
     "exception to 09": lambda chance, body: bytes([body[0], 0x89, chance.choice((1, 2))]),
 }
-
-# ---- damaged as on a line ----
 
 
 def _text_damaged(chance: random.Random, frame: bytes) -> bytes:

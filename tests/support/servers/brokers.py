@@ -95,8 +95,6 @@ def mosquitto(folder: Path) -> Iterator[Broker]:
 
 @contextmanager
 def nats(folder: Path, program: str) -> Iterator[Broker]:
-    """Run a nats-server with MQTT enabled."""
-
     def command(port: int) -> list[str]:
         (folder / "nats.conf").write_text(
             f'server_name: one\nport: -1\nhost: "127.0.0.1"\n'
@@ -177,7 +175,6 @@ class Listener:
 
 
 def publish(broker: Broker, topic: str, payload: bytes, *options: str) -> None:
-    """Publish a message with mosquitto_pub."""
     program = require_program("mosquitto_pub")
     command = [program, "-p", str(broker.port), "-t", topic, "-s", *options]
     subprocess.run(command, input=payload, check=True, timeout=PATIENCE_S)

@@ -12,7 +12,6 @@ def free_port() -> int:
 
 
 def free_ports(count: int) -> list[int]:
-    """Return the numbers of `count` free TCP ports of this computer."""
     with ExitStack() as stack:
         found = [stack.enter_context(closing(socket.create_server(("127.0.0.1", 0)))) for _ in range(count)]
         return [one.getsockname()[1] for one in found]

@@ -26,10 +26,7 @@ CODES = {  # exception code by the text that libmodbus has for it
 
 
 class Mbpoll:
-    """A Modbus client that runs the program mbpoll for each request.
-
-    `where` is a host or a serial port; `options` are further options of the program.
-    """
+    """A Modbus client that runs mbpoll for each request; `where` is a host or a serial port."""
 
     def __init__(self, where: str, *options: str) -> None:
         self._command = [require_program("mbpoll"), "-q", "-o", "10", "-0", *options]
@@ -78,12 +75,10 @@ class Libmodbus:
         return self._process.stdout.readline().split()
 
     def read(self, unit: int, function: int, start: int, count: int) -> list[int] | int:
-        """Return the words or bits read, or an exception code, or NO_REPLY."""
         said, *words = self._ask(unit, function, start, count)
         return int(words[0]) if said == "error" else [int(word) for word in words]
 
     def write(self, unit: int, function: int, start: int, value: int) -> int:
-        """Write a value; return 0, or an exception code, or NO_REPLY."""
         said, *words = self._ask(unit, function, start, value)
         return int(words[0]) if said == "error" else 0
 

@@ -141,8 +141,6 @@ class Node:
 
 
 class Cluster:
-    """NATS servers that form a cluster."""
-
     def __init__(
         self, folder: Path, number: int = 3, program: str | None = None, places: Sequence[Namespace] = ()
     ) -> None:
@@ -162,7 +160,6 @@ class Cluster:
         return [node.url for node in self.nodes]
 
     def wait(self) -> None:
-        """Wait until all servers are healthy."""
         assert self.is_ready_within(PATIENCE_S), "a server of NATS is not ready: see its log"
 
     def is_ready_within(self, seconds: float) -> bool:
@@ -228,7 +225,6 @@ def started_cluster(make: Callable[[int], C]) -> Iterator[C]:
 
 @asynccontextmanager
 async def connected_path(servers: Cluster) -> AsyncIterator[ServerPath]:
-    """Yield a connected path to these servers."""
     path = paths_of(servers.urls)[0]
     await path.open()
     try:

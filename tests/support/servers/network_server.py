@@ -38,7 +38,6 @@ def with_crc(body: bytes) -> bytes:
 
 
 def answer(request: bytes) -> bytes:
-    """Return the reply to a complete request."""
     if len(request) == 8 and request[1] in (3, 4):
         return with_crc(request[:2] + bytes([2 * request[5]]) + bytes(2 * request[5]))
     return request

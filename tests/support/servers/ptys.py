@@ -82,10 +82,7 @@ def receive(fd: int, length: int, patience: float = PATIENCE) -> bytes:
 
 
 class SerialServer:
-    """A network serial port (RFC 2217) with a simulated line behind it.
-
-    Serial settings have no effect; they are only recorded, so that tests can check them.
-    """
+    """A network serial port (RFC 2217) with a simulated line behind it. Serial settings are only recorded."""
 
     def __init__(self, path: str) -> None:
         settings = {"baudrate": 0, "bytesize": 8, "parity": "N", "stopbits": 1}

@@ -127,11 +127,9 @@ class SecuredCluster(Cluster):
             time.sleep(0.02)
 
     def options(self, user: str) -> dict[str, Any]:
-        """Return the connection options of this user."""
         return connect_options(self.urls, self.key(user), self.tls.ca)
 
     def environment(self, user: str) -> dict[str, str]:
-        """Return the environment variables for this user's commands."""
         return {
             **os.environ,
             "MULTIDROP_NATS": ",".join(self.urls),
@@ -151,7 +149,6 @@ def secured_cluster(
 
 
 def multidrop(servers: SecuredCluster, user: str, *words: str) -> CommandEnd:
-    """Run a `multidrop` command as this user."""
     return run_here(servers.environment(user), *words)
 
 

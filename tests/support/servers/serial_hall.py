@@ -77,8 +77,6 @@ class SerialHall:
             for line in self.lines.values()
         )
 
-    # ---- measurements ----
-
     def reset(self) -> None:
         """Restart the measurement of the longest gaps."""
         with self._lock:
@@ -103,8 +101,6 @@ class SerialHall:
         now = time.monotonic()
         with self._lock:
             return all(now - line.last_s < within_s for line in self.lines.values())
-
-    # ---- the servers' thread ----
 
     def _serve(self) -> None:
         while not self._is_over:
