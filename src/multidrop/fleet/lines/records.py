@@ -48,7 +48,7 @@ class FleetRecords:
             for bucket in names.OWNERS
         }
         self._of: dict[str, dict[str, Record | None]] = {}  # ownership records, by line and bucket
-        self._owned: dict[Owner, set[str]] = {}  # by session: lines with an ownership record of it
+        self._owned: dict[Owner, set[str]] = {}  # by session: lines with a record that names it
         self._masters: dict[str, tuple[str, int]] = {}  # by line: its master, and the number of its last move
         self.plant = Follower(Bucket(names.PLANT, path), self._note_plant)
         self._has_plant_changed = False

@@ -52,7 +52,7 @@ PARAMETER_KINDS = {
 
 
 class PageFile(NamedTuple):
-    """One file of the page."""
+    """One file of the gateway's web page."""
 
     body: bytes
     media_type: str

@@ -292,7 +292,7 @@ class SeenFrames:
         self.clock = clock
         self._commands = commands
         self._made: dict[int, int] = {}  # by frame number: when the frame was made (ns)
-        # by frame number: the admitted commands that contained this number
+        # by frame number: the admitted commands whose senders had seen this frame
         self._came: dict[int, set[object]] = {}
 
     def note(self, n: int) -> None:

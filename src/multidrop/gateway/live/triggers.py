@@ -111,7 +111,7 @@ class Triggers:
                 self._conditions = found
 
     async def close(self) -> None:
-        """Do nothing, because triggers are only in memory."""
+        """Return immediately, because triggers are only in memory."""
 
     def as_answer(self) -> list[dict[str, Any]]:
         """Return the last trigger of each name for clients, the newest first.

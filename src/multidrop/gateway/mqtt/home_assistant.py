@@ -115,7 +115,7 @@ BINARY = {"problem": {RUNS: "OFF", STANDS: "OFF", FAULT: "ON"}, "running": {RUNS
 
 
 def _unused(key: str, parts: Mapping[str, Any]) -> str:
-    """Return `key`, or a variant of it if a component has this key, as when a register is named "running"."""
+    """Return `key`, with "_" appended if a component has this key, as when a register is named "running"."""
     return _unused(f"{key}_", parts) if key in parts else key
 
 

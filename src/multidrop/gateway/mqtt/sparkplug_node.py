@@ -28,7 +28,7 @@ from multidrop.gateway.parts import PartContext
 
 STATE, FAULT, STOP = "state", "fault", "Device Control/Stop"
 OWN = (STATE, FAULT)  # names of the two text metrics that every drive has
-REGISTERS = "registers/"  # prefix of a metric's name if its register has one of the names in OWN
+REGISTERS = "registers/"  # prefix of the metric of a register that is itself called "state" or "fault"
 _log = logging.getLogger("multidrop.gateway.mqtt.part")
 MOST_PAST = 500  # limit of historical values in flight
 Value = float | str | None
