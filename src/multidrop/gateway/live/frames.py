@@ -118,7 +118,7 @@ class TimeNumbers(dict[Times, int]):
 def _unknown(
     hub: Hub, newest: KeptRow | None, good: KeptRow | None, times: TimeNumbers, now: Times
 ) -> tuple[Any, ...]:
-    """Return the entry of a value that is not fresh: None, index of the age, status of the newest read.
+    """Return the entry of a value that is not fresh: None, an index into `ages_ms`, and the reason.
 
     If an earlier read succeeded, its value and the index of its age follow.
     """

@@ -26,8 +26,7 @@ Known = tuple[Register[Any], KeptRow | None, KeptRow | None, bool]
 STATES = RUNS, STANDS, FAULT, SILENT, UNKNOWN = "runs", "stands", "fault", "silent", "unknown"
 UNNAMED = "it shows a fault"  # text of a fault without a text of its own
 NOT_ASKED = "not asked recently"  # text for the state UNKNOWN if the drive was not polled recently
-# text for the state UNKNOWN if some values are missing, so that the drive may have a fault
-INCOMPLETE = "not all of its values are known"
+INCOMPLETE = "not all of its values are known"  # text for the state UNKNOWN if some values are missing
 _STATES = {
     Condition.STOPPED: STANDS,
     Condition.RUNNING: RUNS,
