@@ -351,7 +351,7 @@ class Poller(RowSource):
 
     def _check_polling(self) -> None:
         if self._closing:
-            raise ValueError("polling has ended: no line can be added or removed")
+            raise ValueError("polling has ended: no line or drive can be added or removed")
         if self.failure:
             raise self.failure
 
@@ -388,6 +388,7 @@ class Poller(RowSource):
     @undisturbed
     def _add(self, line: str, polled: PolledDrive) -> None:
         with self._changing:
+            self._check_polling()
             names = {drive.name for bus in self.buses.values() for drive in bus.drives}
             if polled.drive.name in names:
                 raise ValueError(f"two drives are called {polled.drive.name}; give each its own name")

@@ -116,6 +116,8 @@ def test_invalid_additions_and_removals_are_errors(port: str) -> None:
         with pytest.raises(ValueError, match="there is no drive 'pump-2' on line 'line'"):
             poller.remove("line", "pump-2")
         assert list(poller.summary()["lines"]["line"]["drives"]) == ["pump-1"]
+    with pytest.raises(ValueError, match="polling has ended"):
+        poller.add("line", pump(2))
 
 
 @pytest.mark.slow
