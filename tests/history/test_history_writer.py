@@ -444,9 +444,9 @@ async def test_exports_of_a_history_start_outside_the_event_loop(tmp_path: Path,
     readers: list[int] = []
 
     class Noted(History):
-        def parting_of(self, *of: Any) -> Any:
+        def unit_history_of(self, *of: Any) -> Any:
             readers.append(threading.get_ident())
-            return super().parting_of(*of)
+            return super().unit_history_of(*of)
 
     async with historian_in(tmp_path) as part:
         part.history = Noted(part.history.folder)

@@ -163,11 +163,11 @@ class YD1000(Drive):
       first writes the bits without the run bit, at rest. It runs the motor only if 1202H then changes to that
       speed.
     - The effect of bit 7, the direct-current brake, during run and stop is not stated: it is never set.
-    - Bit 13 (reset) and 12 (emergency stop) are held for a moment only: related drives restart
-      repeatedly while a bit is set. A reset has bit 15 and not the run bit; its reply may be cut off, and 3 s
-      later the stop is written again. A restart may clear bit 15, as power-on does (section 8.1). Then the
-      terminals command the motor until the stop is written: a reset is refused while a terminal says run. The
-      table of functions is missing: the functions 2 and 3, which the terminals F and R have, count as run.
+    - Related drives restart repeatedly while bit 13 (reset) or 12 (emergency stop) is set. So the stop word
+      follows 3 s after a reset, and when an emergency stop has stopped the motor. A reset has bit 15 and not
+      the run bit; its reply may be cut off. A restart may clear bit 15, as power-on does (section 8.1). Then
+      the terminals command the motor until the stop is written: a reset is refused while a terminal says run.
+      The table of functions is missing: functions 2 and 3, which the terminals F and R have, count as run.
     - Jog is written without the run bit, which would turn the motor at the setpoint if jog is not obeyed.
     - 1200H and 1201H are called present values, but are frozen in a trip: only 1100H is live. The motor
       counts as stopped when 1100H is 0 twice. After a trip 1100H is 0, and 1200H is not. A trip at rest, such

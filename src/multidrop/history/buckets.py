@@ -177,12 +177,12 @@ class UnitBuckets:
         self._grid = grid
         self._by_unit: dict[str, Accumulator] = {}
         self._newest_ns: dict[str, int] = {}
-        self.untold = Accumulator(grid)
+        self.without_unit = Accumulator(grid)
 
     def of_unit(self, unit: str | None, newest_ns: int) -> Accumulator:
         """Return the accumulator for rows with this unit. `newest_ns` is the time of their newest row."""
         if unit is None:
-            return self.untold
+            return self.without_unit
         self._newest_ns[unit] = max(newest_ns, self._newest_ns.get(unit, newest_ns))
         return self._by_unit.setdefault(unit, Accumulator(self._grid))
 
@@ -194,5 +194,5 @@ class UnitBuckets:
         else:
             parts = [*self._by_unit.values()]
         for part in parts:
-            self.untold.add_all(part)
-        return self.untold.buckets(unit, left_out)
+            self.without_unit.add_all(part)
+        return self.without_unit.buckets(unit, left_out)

@@ -10,7 +10,15 @@ from pathlib import Path
 from multidrop.history.buckets import Buckets, Grid, UnitBuckets, grid_of
 from multidrop.history.database import MissingDuckDB
 from multidrop.history.folder import HistoryFile, Listing, listing
-from multidrop.history.quantities import Moment, OtherColumn, Parting, Series, ns_of, parsed_series, units_of
+from multidrop.history.quantities import (
+    Moment,
+    OtherColumn,
+    Series,
+    UnitHistory,
+    ns_of,
+    parsed_series,
+    units_of,
+)
 from multidrop.history.sources import (
     ALWAYS,
     MOST_TRIES,
@@ -97,24 +105,24 @@ class History:
         first = ALWAYS[0] if begin is None else ns_of(begin)
         return HistoryRows(self, parsed_series(series), first, ALWAYS[1] if end is None else ns_of(end))
 
-    def parting_of(self, series: Sequence[Series] | None, begin: int, end: int) -> Parting:
+    def unit_history_of(self, series: Sequence[Series] | None, begin: int, end: int) -> UnitHistory:
         """Return the newest and the earlier quantities of the series (None: all series) in this range."""
-        parting = Parting({}, series)
-        self._sources.again(lambda found: self._learnt(found, series, begin, end, parting))
-        return parting
+        units = UnitHistory({}, series)
+        self._sources.again(lambda found: self._learnt(found, series, begin, end, units))
+        return units
 
     def rows_of(
-        self, series: Sequence[Series] | None, begin: int, end: int, parting: Parting
+        self, series: Sequence[Series] | None, begin: int, end: int, units: UnitHistory
     ) -> Iterator[Rows]:
         """Yield the rows that `read` returns, for parsed series and times in ns."""
-        found = self._sources.again(lambda found: self._learnt(found, series, begin, end, parting))
+        found = self._sources.again(lambda found: self._learnt(found, series, begin, end, units))
         given = 0  # number of the newest segment whose rows were yielded
         for number in sorted({*found.segments, *found.rows}):
             if number <= given:
                 continue
             for _ in range(MOST_TRIES):
                 try:
-                    yield from self._rows_of_segment(number, found, series, begin, end, parting)
+                    yield from self._rows_of_segment(number, found, series, begin, end, units)
                     break
                 except Replaced:  # no row was yielded yet, so the segment can be read from its new file
                     found = self._sources.listing()
@@ -129,14 +137,14 @@ class History:
             raise OSError(f"{self.folder}: files were merged while they were read: read them again")
 
     def _learnt(
-        self, found: Listing, series: Sequence[Series] | None, begin: int, end: int, parting: Parting
+        self, found: Listing, series: Sequence[Series] | None, begin: int, end: int, units: UnitHistory
     ) -> Listing:
-        """Add the units of all listed segments to `parting`, and return the listing."""
+        """Add the quantities of all listed segments to `units`, and return the listing."""
         known = self._sources.known(found, begin, end)
-        new = parting.unknown_of(known)
+        new = units.unknown_of(known)
         if files := [found.rows[number] for number in new if number in found.rows and not known[number]]:
             known |= units_in_rows(self._sources, files, series, begin, end)
-        parting.learn(known)
+        units.learn(known)
         return found
 
     def _rows_of_segment(
@@ -146,9 +154,9 @@ class History:
         series: Sequence[Series] | None,
         begin: int,
         end: int,
-        parting: Parting,
+        units: UnitHistory,
     ) -> Iterator[Rows]:
-        file, renamed = found.rows.get(number), parting.renamed(number)
+        file, renamed = found.rows.get(number), units.renamed(number)
         if file and file.may_have(begin, end):
             yield from rows_of_file(self._sources, file, series, begin, end, renamed)
         elif number in found.segments:
@@ -179,37 +187,37 @@ class History:
 
         def gathered(found: Listing) -> dict[str, Buckets]:
             into = {name: UnitBuckets(grid) for name in names}
-            parting = Parting(self._sources.known(found, grid.begin, grid.end), names)
-            self._gather(found, into, grid, parting)
+            units = UnitHistory(self._sources.known(found, grid.begin, grid.end), names)
+            self._gather(found, into, grid, units)
             return {
-                ".".join(name): made.buckets(parting.unit_of(name), parting.left_out.get(name, ()))
+                ".".join(name): made.buckets(units.unit_of(name), units.left_out.get(name, ()))
                 for name, made in into.items()
             }
 
         return self._sources.again(gathered)
 
     def _gather(
-        self, found: Listing, into: Mapping[Series, UnitBuckets], grid: Grid, parting: Parting
+        self, found: Listing, into: Mapping[Series, UnitBuckets], grid: Grid, units: UnitHistory
     ) -> None:
         everything = tuple(into)
         # A file of ten-second summaries may cover many segments. If a register changed its unit in between,
         # read each segment instead.
-        tens = [file for file in found.tens if grid.is_of_tens and parting.is_whole(file.first, file.last)]
-        reckoned = {number for file in tens for number in range(file.first, file.last + 1)}
-        parted: dict[tuple[str, tuple[Series, ...]], list[HistoryFile]] = {(OF_TENS, everything): tens}
+        tens = [file for file in found.tens if grid.is_of_tens and units.is_whole(file.first, file.last)]
+        covered = {number for file in tens for number in range(file.first, file.last + 1)}
+        by_source: dict[tuple[str, tuple[Series, ...]], list[HistoryFile]] = {(OF_TENS, everything): tens}
         for number, file in found.rows.items():
-            if number not in reckoned:
-                parted.setdefault((OF_ROWS, parting.series_of(number)), []).append(file)
-        for (sums, series), files in parted.items():
+            if number not in covered:
+                by_source.setdefault((OF_ROWS, units.series_of(number)), []).append(file)
+        for (sums, series), files in by_source.items():
             files = [file for file in files if file.may_have(grid.begin, grid.end)]
             if files and series:
                 gather_files(
-                    self._sources, files, sums, {one: into[one] for one in series}, grid, parting.newest
+                    self._sources, files, sums, {one: into[one] for one in series}, grid, units.newest
                 )
-        for number in sorted(set(found.segments) - reckoned):
+        for number in sorted(set(found.segments) - covered):
             with self._sources.segment(number, found, grid.begin, grid.end) as segment:
                 if segment:
-                    segment.gather({one: into[one].untold for one in parting.series_of(number)}, grid)
+                    segment.gather({one: into[one].without_unit for one in units.series_of(number)}, grid)
 
     # ---- export ----
 
@@ -260,11 +268,11 @@ class History:
                 batch
                 for number in sorted(found.segments)
                 for batch in self._rows_of_segment(
-                    number, found, rows.series, rows.begin, rows.end, rows.parting
+                    number, found, rows.series, rows.begin, rows.end, rows.units
                 )
             )
-            self._learnt(found, rows.series, rows.begin, rows.end, rows.parting)
-            renamed = {file.first: rows.parting.renamed(file.first) for file in files}
+            self._learnt(found, rows.series, rows.begin, rows.end, rows.units)
+            renamed = {file.first: rows.units.renamed(file.first) for file in files}
             of = rows.series, (rows.begin, rows.end), rows.metadata, renamed
             return write_parquet(self._sources, target, batches, files, *of)
 
@@ -286,11 +294,11 @@ class HistoryRows(RecordingReader):
         super().__init__(history.folder)
         self._history = history
         self.series, self.begin, self.end = series, begin, end
-        self.parting = history.parting_of(series, begin, end)
-        self.metadata = self.parting.described(history.metadata())
+        self.units = history.unit_history_of(series, begin, end)
+        self.metadata = self.units.described(history.metadata())
 
     def __iter__(self) -> Iterator[Rows]:
-        return self._history.rows_of(self.series, self.begin, self.end, self.parting)
+        return self._history.rows_of(self.series, self.begin, self.end, self.units)
 
 
 def _renamed(rows: list[Row], others: Iterable[OtherColumn]) -> list[Row]:

@@ -89,7 +89,7 @@ class OtherColumn(NamedTuple):
     column: str
 
 
-class Parting:
+class UnitHistory:
     """The quantity (unit, or names of values) that each series has now, and those that it had earlier.
 
     Buckets exclude values of earlier quantities.

@@ -179,7 +179,7 @@ _BUCKETS = f"""
 select drive, register, {{unit}}, (epoch_ns(time) - $begin) // $step, {{sums}}
 from {{files}} where {_IN_RANGE}{{condition}} group by all
 """
-_TOLD = "unit, max(epoch_ns(time))"
+_BY_UNIT = "unit, max(epoch_ns(time))"
 _UNITS = f"""
 select filename, drive, register, unit
 from {{files}} where {_IN_RANGE}{{condition}} and unit is not null group by all order by max(epoch_ns(time))
@@ -226,7 +226,7 @@ def gather_files(
     values |= {"begin": grid.begin, "end": grid.end, "step": grid.step}
     paths = [file.path for file in files]
     is_known = all(series in described for series in into)
-    unit, table = ("null, 0", files_of(paths)) if is_known else (_TOLD, with_units(paths))
+    unit, table = ("null, 0", files_of(paths)) if is_known else (_BY_UNIT, with_units(paths))
     query = _BUCKETS.format(unit=unit, sums=sums, files=table, condition=condition)
     with sources.cursor() as cursor, while_there(files):
         found = cursor.execute(query, values).fetchall()

@@ -144,7 +144,7 @@ def _fields(plugin: Mapping[str, Any]) -> Iterator[_Field]:
         for block in plugin.get(kind) or () if style in ("", kind) else ():
             for field in block.get("fields") or ():
                 table = block.get("register", "holding") if kind == "request" else field.get("register")
-                order = str(block.get("byte_order") or "ABCD")  # default of the plugin in these styles
+                order = str(block.get("byte_order") or "ABCD")  # the default of Telegraf in these styles
                 yield _Field(field, kind, block.get("slave_id", slave), table or "holding", order, text)
 
 

@@ -162,7 +162,7 @@ DAMAGES: Mapping[str, Callable[[bytes, int, int], bytes]] = {
     "flip": lambda frame, at, bit: frame[:at] + bytes([frame[at] ^ 1 << bit]) + frame[at + 1 :],
     "repeat": lambda frame, at, bit: frame[: at + 1] + frame[at:],
 }
-DRIFT_S = 20.0  # s of one cycle of a load that changes slowly
+DRIFT_S = 20.0  # period in s of a load that changes slowly
 
 
 class FaultyWire(Wire):
