@@ -137,7 +137,7 @@ class Hardware:
                 lines.readline()
 
     def do_registers(self, name: None) -> list[str]:
-        """Return the UART registers that the guest has written, and the speeds that it has set, in order."""
+        """Return the UART registers that the guest has read and written, and the speeds that it has set."""
         return (self._folder / "registers").read_text("utf-8").splitlines()
 
 

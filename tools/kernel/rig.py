@@ -130,7 +130,7 @@ def _qemu(built: Path, folder: Path, ports: str) -> list[str]:
     -device qemu-xhci,id=xhci -device usb-serial,bus=xhci.0,chardev=usb,serial=QEMU0001
     -chardev socket,id=uart,path={folder}/uart,server=on,wait=off
     -device isa-serial,iobase=0x2f8,irq=3,chardev=uart
-    -trace serial_write -trace serial_update_parameters -D {folder}/registers
+    -trace serial_read -trace serial_write -trace serial_update_parameters -D {folder}/registers
     """.split()
     kernel = "console=ttyS0 quiet loglevel=4 mitigations=off panic=1 no_console_suspend"
     # on a busy host, the kernel's timer check would fail
@@ -141,7 +141,7 @@ def main(words: list[str]) -> None:
     folder, scenario, *given = words
     arguments = {name: json.loads(value) for name, _, value in (word.partition("=") for word in given)}
     with boot(Path(folder).resolve()) as guest:
-        json.dump(guest.run(scenario, limit=600.0, **arguments), sys.stdout, indent=2)
+        json.dump(guest.run(scenario, limit=3600.0, **arguments), sys.stdout, indent=2)
 
 
 if __name__ == "__main__":

@@ -429,6 +429,13 @@ def test_each_mistaken_tool_port_setting_is_reported(text: str, sentence: str, t
     assert sentence in mistake
 
 
+def test_on_windows_one_sentence_says_that_there_are_no_tool_ports(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Windows' event loop has no `add_reader`, which tool ports need."""
+    monkeypatch.setattr("multidrop.gateway.modbus_server.tool_ports.sys.platform", "win32")
+    with pytest.raises(ValueError, match=r"^Windows has no tool ports, because [^\n]*; use Linux$"):
+        ToolSettings(rtu={"hall": "127.0.0.1:4001"})
+
+
 LINES = """
 [[line]]
 name = "hall"

@@ -195,27 +195,25 @@ def uart(wanted: list[tuple[int, str]]) -> list[dict[str, Any]]:
     return facts
 
 
-def uart_modes() -> dict[str, Any]:
-    """Read two values from QEMU's UART with each option for switching a transceiver."""
-    plug.do("connect", {"serial": "uart"})
-    modes = ("rts-up", "rts-down", "kernel")
-    return {mode: attempt(_values, "/dev/ttyS1", 9600, "8N1", rs485=mode) for mode in modes}
-
-
-def rs485_mode() -> dict[str, Any] | None:
-    """Read in the driver's RS-485 mode; return the written UART registers, None without its module."""
-    if subprocess.run(["modprobe", "rs485_uart"], check=False).returncode:
-        return None
+def uart_mode(mode: str) -> dict[str, Any]:
+    """Read two values while `mode` switches a transceiver; also return the driver's accesses to the UART."""
     plug.do("connect", {"serial": "uart"})
     before = len(plug.do("registers"))
+    read = attempt(insist, _values, "/dev/ttyS1", 9600, "8N1", rs485=mode)
+    return {"read": read, "registers": plug.do("registers")[before:]}
+
+
+def rs485_mode() -> dict[str, Any]:
+    """Do the same in the driver's RS-485 mode; also return the finding of `multidrop doctor`."""
+    subprocess.run(["modprobe", "rs485_uart"], check=True)
     try:
+        plug.do("connect", {"serial": "uart"})
         _, text = run("doctor", "/dev/ttyS1", "--json")
-        read = attempt(insist, _values, "/dev/ttyS1", 9600, "8N1", rs485="kernel")
-        registers = plug.do("registers")[before:]
+        facts = uart_mode("kernel")
     finally:
         subprocess.run(["rmmod", "rs485_uart"], check=True)
     findings = {finding["topic"]: finding["what"] for finding in json.loads(text)["findings"]}
-    return {"doctor": findings["RS-485 mode"], "read": read, "registers": registers}
+    return {"doctor": findings["RS-485 mode"]} | facts
 
 
 def stalling_family(kind: str, family: str, seconds: float) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import socket
+import sys
 from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -126,6 +127,8 @@ class ToolSettings:
                     yield f"{key}: all drives of line {name} speak Delixi's own protocol; tools need Modbus"
 
     def _mistakes(self) -> Iterator[str]:
+        if sys.platform == "win32":
+            yield "Windows has no tool ports, because its event loop cannot watch their sockets; use Linux"
         if not self.lines:
             yield 'pty and rtu are empty; write pty = { hall = "/run/multidrop/hall" } with a line\'s name'
         if self.may not in ROLES:
