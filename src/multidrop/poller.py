@@ -17,7 +17,14 @@ from typing import Any, TypeVar, overload
 from multidrop.bus import Bus
 from multidrop.control.eeprom_ledger import Ledger
 from multidrop.control.exit_hook import exit_hook, give_signals_back, without_internals
-from multidrop.core import REALTIME_ENDED, Mastership, Realtime, RowQueue, why_not_realtime
+from multidrop.core import (
+    REALTIME_ENDED,
+    WHY_NOT_NICE,
+    Mastership,
+    Realtime,
+    RowQueue,
+    why_not_realtime,
+)
 from multidrop.core.process import register_at_fork, undisturbed
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
@@ -34,6 +41,8 @@ from multidrop.transport.aside_log import log_aside, traceback_of, words_of
 from multidrop.transport.statistics import LineStatistics
 
 LOOK_NS = 50_000_000  # interval between checks of the lines, if a line has a problem or `fileno` is in use
+# the same interval if realtime scheduling was granted, so that values reach the program earlier
+PROMPT_NS = 20_000_000
 # interval between checks of the lines, if lines only need new exchanges; shorter than AHEAD_NS, so that no
 # line runs out of queued exchanges
 BUSY_NS = 100_000_000
@@ -62,8 +71,8 @@ class Poller(RowSource):
     polling. `ledger`, `audit`, `stop_on_exit` and `mastership` are as in Bus.
 
     With `realtime`, or with the key `realtime` in the plant file, the core's thread is scheduled before all
-    normal threads until the poller is closed. If the system refuses this, a warning is logged, and the poller
-    works without it.
+    normal threads until the poller is closed. The threads that take batches then have the nice value -10. If
+    the system refuses this, a warning is logged, and the poller works without it.
 
     Raises LineError if a port cannot be opened. Later failures appear as rows with the reason why a value is
     missing. An exception on one line, such as one in a user's own class, is logged, and the line is tried
@@ -89,9 +98,8 @@ class Poller(RowSource):
         check_channels(plant)
         row_queue = RowQueue()
         self._is_realtime_given = realtime
-        self._realtime = Realtime()
         self._lines = LineSet(row_queue, ledger, audit, mastership)
-        super().__init__(row_queue, self._lines.names)
+        super().__init__(row_queue, self._lines.names, Realtime())
         self._path, self._totals = plant.path, plant.totals
         self._thread = threading.Thread(target=self._run, name="multidrop poller", daemon=True)
         self._look_ns = 0  # time of the next check of the lines that the core has not reported
@@ -126,6 +134,7 @@ class Poller(RowSource):
         self._over, self._caller = threading.Event(), None
         self._over.set()
         self._added = AddedRows(self._names)
+        self._realtime = Realtime()
         self._changing = threading.Lock()
         self._ending = threading.Lock()
         self._wakeup.close()
@@ -235,6 +244,10 @@ class Poller(RowSource):
 
     def _tend_lines(self) -> None:
         """Wait for the core's reports or the next check; then call `tend` of the lines that need it."""
+        try:
+            self._realtime.lower_nice()
+        except OSError:
+            log_aside(_log, logging.WARNING, WHY_NOT_NICE)
         seconds = max(0, self._look_ns - clock.now_ns()) / 1e9
         called = self._lines.called(self._row_queue.await_calls(seconds))
         now = clock.now_ns()
@@ -242,7 +255,8 @@ class Poller(RowSource):
             restless = [line for line in self._lines if not line.is_steady(now)]
             called = list(dict.fromkeys([*restless, *called]))
             needs_looks = self._is_watched or not all(line.is_well(now) for line in restless)
-            self._look_ns = now + (LOOK_NS if needs_looks else BUSY_NS if restless else REST_NS)
+            look_ns = PROMPT_NS if self._realtime.is_held else LOOK_NS
+            self._look_ns = now + (look_ns if needs_looks else BUSY_NS if restless else REST_NS)
             if self._realtime.has_ended():
                 log_aside(_log, logging.WARNING, REALTIME_ENDED)
         for line in called:

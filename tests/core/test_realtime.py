@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,6 +18,8 @@ from lines import until
 from multidrop import Plant, Poller
 from multidrop.core import Port, Realtime, wake_lateness
 from multidrop.core import port as core_port
+from multidrop.core.port import NICE
+from multidrop.polling.row_source import ASYNC_LOOK_S, BATCHES_S, PROMPT_S
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="other systems show no thread's scheduling")
 
@@ -57,6 +61,61 @@ def test_only_the_cores_thread_is_scheduled_in_real_time(realtime: Realtime) -> 
     second.want(False)
     assert not policies()[core] & os.SCHED_FIFO
     assert not second.has_ended()  # the client switched realtime scheduling off, not the core
+
+
+def nice_values() -> dict[int, int]:
+    return {thread: os.getpriority(os.PRIO_PROCESS, thread) for thread in threads()}
+
+
+SHOW_NICE = [sys.executable, "-ISc", "import os; print(os.getpriority(os.PRIO_PROCESS, 0))"]
+
+
+def test_only_the_threads_that_pass_on_values_run_before_normal_threads(realtime: Realtime) -> None:
+    """They are the poller's thread, and each thread that has taken values."""
+    taker = threading.get_native_id()
+    before = nice_values()[taker]
+    with Poller(Plant(()), realtime=True) as poller:
+        poller.take()
+        expected = {taker, poller._thread.native_id}
+        until(lambda: {thread for thread, nice in nice_values().items() if nice == NICE} == expected)
+        assert int(subprocess.check_output(SHOW_NICE)) == 0
+    assert nice_values()[taker] == NICE  # another client still wants realtime scheduling
+    realtime.want(False)
+    assert nice_values()[taker] == before
+
+
+def test_without_permission_for_nice_values_one_warning_says_what_to_do(
+    realtime: Realtime, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(which: int, who: int, nice: int) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(os, "setpriority", refuse)
+    with Poller(Plant(()), realtime=True) as poller:
+        poller.take()
+        until(lambda: "LimitNICE=-10" in caplog.text)
+        poller.take()
+        poller._call_thread()
+    assert caplog.text.count("LimitNICE") == 1
+
+
+def test_a_thread_with_its_own_scheduling_keeps_it(realtime: Realtime) -> None:
+    own = os.sched_getscheduler(0)
+    os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+    try:
+        realtime.lower_nice()
+        assert os.sched_getscheduler(0) == os.SCHED_BATCH
+        assert nice_values()[threading.get_native_id()] > NICE
+    finally:
+        os.sched_setscheduler(0, own, os.sched_param(0))
+
+
+def test_values_are_taken_more_often_if_realtime_was_granted() -> None:
+    poller = Poller(Plant(()))
+    assert poller._interval_s(BATCHES_S) == BATCHES_S
+    poller._realtime.is_held = True
+    assert poller._interval_s(BATCHES_S) == poller._interval_s(ASYNC_LOOK_S) == PROMPT_S
+    poller.close()
 
 
 def locked_kb() -> int:

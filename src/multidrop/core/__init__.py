@@ -59,6 +59,7 @@ from multidrop.core.port import NO_DIVISOR as NO_DIVISOR
 from multidrop.core.port import REALTIME_ENDED as REALTIME_ENDED
 from multidrop.core.port import REFUSALS as REFUSALS
 from multidrop.core.port import RS485 as RS485
+from multidrop.core.port import WHY_NOT_NICE as WHY_NOT_NICE
 from multidrop.core.port import Echo as Echo
 from multidrop.core.port import Port as Port
 from multidrop.core.port import Realtime as Realtime

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from enum import IntEnum, StrEnum
 from functools import partial
+from pathlib import Path
 from typing import Any
 from weakref import finalize
 
@@ -146,6 +147,9 @@ _SWITCHES = {
 }
 
 
+NICE = -10  # nice value, under realtime scheduling, of the threads that pass on values from the core
+
+
 class _Engine:
     """The core's thread, one per process, started with the first port."""
 
@@ -159,6 +163,7 @@ class _Engine:
         self._c: Any = None
         self._changing = threading.Lock()
         self._realtime: set[Realtime] = set()
+        self._nice: dict[int, int] = {}  # nice values, before they were lowered, of threads by native id
 
     @property
     def c(self) -> Any:
@@ -182,6 +187,31 @@ class _Engine:
             if failure:
                 self._realtime.discard(client)
                 raise OSError(-failure, os.strerror(-failure))
+            if not self._realtime:
+                self._restore_nice()
+
+    def lower_nice(self) -> None:
+        """Lower the calling thread's nice value to NICE until no client wants realtime scheduling.
+
+        New threads and processes of this thread get normal scheduling. Raises OSError if the system refuses.
+        """
+        thread = threading.get_native_id()
+        if sys.platform != "linux" or thread in self._nice:
+            return
+        with self._changing:
+            nice = os.getpriority(os.PRIO_PROCESS, thread)
+            if not self._realtime or os.sched_getscheduler(thread) & ~os.SCHED_RESET_ON_FORK:
+                return  # a client has just closed, or the program has chosen another scheduling
+            self._nice[thread] = nice
+            if nice > NICE:
+                os.sched_setscheduler(thread, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))
+                os.setpriority(os.PRIO_PROCESS, thread, NICE)
+
+    def _restore_nice(self) -> None:
+        while self._nice:
+            thread, nice = self._nice.popitem()
+            if Path(f"/proc/self/task/{thread}").exists():
+                os.setpriority(os.PRIO_PROCESS, thread, nice)
 
     @property
     def is_realtime(self) -> bool:
@@ -207,6 +237,15 @@ class Realtime:
             _engine.set_realtime(self, wanted)
             self.is_held = wanted
 
+    def lower_nice(self) -> None:
+        """If realtime scheduling was granted, let the calling thread run before most normal threads.
+
+        For threads that pass on values from the core. Raises OSError if the system refuses, but only at the
+        first call of a thread.
+        """
+        if self.is_held:
+            _engine.lower_nice()
+
     def has_ended(self) -> bool:
         """Return True if the thread has returned to normal scheduling by itself; True only once."""
         has_ended = self.is_held and not _engine.is_realtime
@@ -227,6 +266,12 @@ def why_not_realtime(failure: OSError) -> str:
         f"the system refuses it ({failure.strerror}); permit it with LimitRTPRIO=1 and RestrictRealtime=no "
         'in the systemd unit, or with "USER - rtprio 1" in /etc/security/limits.conf and a new login'
     )
+
+
+WHY_NOT_NICE = (
+    "values may reach the program late: permit it with LimitNICE=-10 in the systemd unit, or with "
+    '"USER - nice -10" in /etc/security/limits.conf and a new login'
+)
 
 
 def wake_lateness(seconds: float, *, realtime: bool) -> list[float]:

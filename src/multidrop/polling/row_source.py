@@ -13,7 +13,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Generator, Itera
 from contextlib import suppress
 from functools import partial
 
-from multidrop.core import RowQueue
+from multidrop.core import Realtime, RowQueue
 from multidrop.core.process import undisturbed
 from multidrop.errors import PollingFailed
 from multidrop.polling.added_rows import COMMENT, AddedRows
@@ -123,14 +123,17 @@ class WakeUp:
 
 
 FILLING_NS = 10_000_000  # minimum interval between two batches that are taken from a chunk that is not full
+BATCHES_S = 0.1  # interval between checks for rows in `batches` and `on_batch`
 ASYNC_LOOK_S = 0.05  # interval between checks for rows in `async for`
+PROMPT_S = 0.02  # interval between these checks if realtime scheduling was granted
 
 
 class RowSource:
     """The rows in the core's queue, and the methods by which consumers take rows."""
 
-    def __init__(self, row_queue: RowQueue, names: RowNames) -> None:
+    def __init__(self, row_queue: RowQueue, names: RowNames, realtime: Realtime) -> None:
         self._row_queue = row_queue
+        self._realtime = realtime
         self._names = names
         self._added = AddedRows(names)  # adds the rows of computed channels and of events
         self._wakeup = WakeUp()
@@ -154,7 +157,11 @@ class RowSource:
 
         A chunk that is not full is returned only if FILLING_NS have passed since the last such chunk.
         Raises PollingFailed if polling has failed and no rows are left.
+
+        If realtime scheduling was granted, the calling thread runs before most normal threads from now on.
         """
+        with suppress(OSError):  # the poller's own thread logs why the system refuses this
+            self._realtime.lower_nice()
         now, chunks = clock.now_ns(), self._row_queue.chunks
         if chunks < 2:
             if self._is_watched:
@@ -181,8 +188,13 @@ class RowSource:
         """
         self._added.mark(kind, text, ago)
 
-    def batches(self, seconds: float | None = None, *, every: float = 0.1) -> Iterator[Batch]:
+    def _interval_s(self, usual: float) -> float:
+        return PROMPT_S if self._realtime.is_held else usual
+
+    def batches(self, seconds: float | None = None, *, every: float | None = None) -> Iterator[Batch]:
         """Yield batches, about one every `every` s, for `seconds` s or until the poller is closed.
+
+        `every` None means 0.1 s, or 0.02 s if realtime scheduling was granted.
 
         Once the poller is closed, the remaining batches are yielded immediately. Raises PollingFailed like
         `take`.
@@ -190,8 +202,9 @@ class RowSource:
         end_ns = None if seconds is None else clock.now_ns() + round(seconds * 1e9)
         is_over = False
         while not is_over and (end_ns is None or clock.now_ns() < end_ns):
-            left = every if end_ns is None else max(0.0, (end_ns - clock.now_ns()) / 1e9)
-            is_over = self._over.wait(min(every, left))
+            pause = self._interval_s(BATCHES_S) if every is None else every
+            left = pause if end_ns is None else max(0.0, (end_ns - clock.now_ns()) / 1e9)
+            is_over = self._over.wait(min(pause, left))
             while batch := self.take():
                 yield batch
 
@@ -213,10 +226,10 @@ class RowSource:
             while batch := self.take():
                 yield batch
             if not is_over:
-                await asyncio.sleep(ASYNC_LOOK_S)
+                await asyncio.sleep(self._interval_s(ASYNC_LOOK_S))
 
     @undisturbed
-    def on_batch(self, function: Callable[[Batch], object], *, every: float = 0.1) -> None:
+    def on_batch(self, function: Callable[[Batch], object], *, every: float | None = None) -> None:
         """On a separate thread, call `function` with each of `batches()`, until the poller is closed.
 
         A slow function delays no line: rows wait in the core's queue, and if it is full, further rows are
