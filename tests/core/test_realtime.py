@@ -63,6 +63,15 @@ def test_only_the_cores_thread_is_scheduled_in_real_time(realtime: Realtime) -> 
     assert not second.has_ended()  # the client switched realtime scheduling off, not the core
 
 
+@pytest.fixture
+def _usual_nice() -> Iterator[None]:
+    """Give the test's thread the nice value 0, which the threads that it starts inherit."""
+    before = os.getpriority(os.PRIO_PROCESS, 0)
+    os.setpriority(os.PRIO_PROCESS, 0, 0)
+    yield
+    os.setpriority(os.PRIO_PROCESS, 0, before)
+
+
 def nice_values() -> dict[int, int]:
     return {thread: os.getpriority(os.PRIO_PROCESS, thread) for thread in threads()}
 
@@ -70,10 +79,10 @@ def nice_values() -> dict[int, int]:
 SHOW_NICE = [sys.executable, "-ISc", "import os; print(os.getpriority(os.PRIO_PROCESS, 0))"]
 
 
+@pytest.mark.usefixtures("_usual_nice")
 def test_only_the_threads_that_pass_on_values_run_before_normal_threads(realtime: Realtime) -> None:
     """They are the poller's thread, and each thread that has taken values."""
     taker = threading.get_native_id()
-    before = nice_values()[taker]
     with Poller(Plant(()), realtime=True) as poller:
         poller.take()
         expected = {taker, poller._thread.native_id}
@@ -81,9 +90,10 @@ def test_only_the_threads_that_pass_on_values_run_before_normal_threads(realtime
         assert int(subprocess.check_output(SHOW_NICE)) == 0
     assert nice_values()[taker] == NICE  # another client still wants realtime scheduling
     realtime.want(False)
-    assert nice_values()[taker] == before
+    assert nice_values()[taker] == 0
 
 
+@pytest.mark.usefixtures("_usual_nice")
 def test_without_permission_for_nice_values_one_warning_says_what_to_do(
     realtime: Realtime, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -99,13 +109,14 @@ def test_without_permission_for_nice_values_one_warning_says_what_to_do(
     assert caplog.text.count("LimitNICE") == 1
 
 
+@pytest.mark.usefixtures("_usual_nice")
 def test_a_thread_with_its_own_scheduling_keeps_it(realtime: Realtime) -> None:
     own = os.sched_getscheduler(0)
     os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     try:
         realtime.lower_nice()
         assert os.sched_getscheduler(0) == os.SCHED_BATCH
-        assert nice_values()[threading.get_native_id()] > NICE
+        assert nice_values()[threading.get_native_id()] == 0
     finally:
         os.sched_setscheduler(0, own, os.sched_param(0))
 
