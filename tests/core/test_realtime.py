@@ -65,7 +65,7 @@ def test_only_the_cores_thread_is_scheduled_in_real_time(realtime: Realtime) -> 
 
 @pytest.fixture
 def _usual_nice() -> Iterator[None]:
-    """Give the test's thread the nice value 0, which the threads that it starts inherit."""
+    """Give the nice value 0 to the test's thread, and so to the threads that it starts."""
     before = os.getpriority(os.PRIO_PROCESS, 0)
     os.setpriority(os.PRIO_PROCESS, 0, 0)
     yield
