@@ -168,7 +168,7 @@ DIVISOR_ACCESS, RTS, IS_EMPTY = 0x80, 2, 0x40  # bits of LINE_CONTROL, MODEM_CON
 
 
 def check_transceiver(registers: list[str], sending: int) -> None:
-    """Check that RTS has the level `sending` from each request until the UART has reported that it is empty."""
+    """Check that RTS has the level `sending` from each request until the UART reports that it is empty."""
     events = ""  # S: byte sent while RTS is `sending`; s: otherwise; e: UART is empty; -: RTS is set back
     line_control, rts = 0, None
     for access, register, text in UART_REGISTER.findall("\n".join(registers)):
