@@ -490,9 +490,9 @@ def test_the_flight_recorder_saves_a_capture_when_a_drive_s_replies_are_damaged(
 
 @pytest.fixture
 def wire() -> Iterator[Faulty]:
-    one_flight = Faulty([EncodedDrive(InnovertIBD(1))], lambda reply: reply, unpaced=True)
-    with Simulator([one_flight]):
-        yield one_flight
+    faulty = Faulty([EncodedDrive(InnovertIBD(1))], lambda reply: reply, unpaced=True)
+    with Simulator([faulty]):
+        yield faulty
 
 
 @pytest.fixture

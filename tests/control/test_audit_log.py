@@ -125,7 +125,7 @@ Noted = list[tuple[str, str | None, str | None]]
 
 
 class Audited:
-    """A bus with one CHE drive and an audit log, and a method that returns the log's records."""
+    """A bus with one drive and an audit log, and a method that returns the log's records."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

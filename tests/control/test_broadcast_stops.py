@@ -178,7 +178,7 @@ def test_a_failed_broadcast_counts_as_sent_only_if_bytes_were_sent(tmp_path: Pat
 
 @pytest.mark.parametrize("address", [1, 2])
 def test_a_broadcast_is_refused_if_one_drive_is_of_another_family(address: int) -> None:
-    """At the address of a CHE's control word, a Goodrive has its setpoint."""
+    """At the address of an INVT CHE's control word, a Goodrive has its setpoint."""
     sims = [simulated(InvtCHE(at, maximum_frequency=50)) for at in (1, 2)]
     sims[address - 1]["device"] = 0x010A
     line = SimulatedBus(*sims)

@@ -160,7 +160,7 @@ async def test_without_threads_no_stop_is_repeated_before_all(threads: Threads, 
 
 
 @pytest.mark.slow
-def test_stops_without_threads_do_not_block_the_event_loop(threads: Threads) -> None:
+def test_if_no_thread_can_start_stops_do_not_block_the_event_loop(threads: Threads) -> None:
     motors = Motors(a=3, b=2)
     turns = 0
 

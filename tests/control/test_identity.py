@@ -27,7 +27,7 @@ from multidrop.families.invt_che import CHEControl
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 from multidrop.transport import clock, peers
 
-GOODRIVE = 0x010A  # device code of another INVT series; a CHE has 0101H
+GOODRIVE = 0x010A  # device code of another INVT series; an INVT CHE has 0101H
 GOODRIVE_DEVICE = 0x2103  # register of the device code in a Goodrive (Goodrive200A manual p. 140)
 
 
@@ -329,7 +329,7 @@ def test_an_unambiguous_identity_check_before_a_stop_confirms_the_drive(is_in_st
 
 
 def test_an_identity_check_by_undocumented_registers_never_withholds_a_stop() -> None:
-    """The IBD's `identify` reads registers that its manual does not document."""
+    """The `identify` of InnovertIBD reads registers that its manual does not document."""
     bus = SimulatedBus(simulated(InnovertIBD(1)))
     bus.attach(InvtCHE(1))
 
@@ -573,7 +573,7 @@ def answers_as(line: SimulatedBus, counts: dict[int, int]) -> None:
 
 
 def test_a_drive_that_lacks_another_makes_registers_is_checked_for_them_once() -> None:
-    """An IBD does not answer reads of registers that it lacks. Each of them delays the drive's polling."""
+    """An INNOVERT IBD does not answer reads of registers that it lacks. Each such read delays polling."""
     line, drive, _ = one(InnovertIBD(1, confirmed=1))
     count_silences(line)
     drive.set_frequency(20)

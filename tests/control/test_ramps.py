@@ -188,7 +188,7 @@ def test_a_staggered_start_does_not_stop_drives_it_never_reached() -> None:
 
 
 def test_a_failed_staggered_start_sends_no_stop_to_a_drive_of_unknown_identity() -> None:
-    """An IBD's stop writes 0001H to the address 2000H, which runs an INVT Goodrive."""
+    """An INNOVERT IBD's stop writes 0001H to the address 2000H, which runs an INVT Goodrive."""
     sims: list[Any] = [simulated(InnovertIBD(1)), simulated(PROFILES["invt-goodrive"](2))]
     line = SimulatedBus(*sims)
     drives: list[Any] = [line.attach(InnovertIBD(address)) for address in (1, 2)]
@@ -283,7 +283,7 @@ def test_without_threads_all_started_drives_get_a_stop_before_a_wait(monkeypatch
     assert noted.calls == [(1, 0.0), (2, 0.0), (1, None), (2, None)]
 
 
-def test_interrupted_stops_without_threads_are_each_sent_once_more(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_if_no_thread_can_start_interrupted_stops_are_sent_again(monkeypatch: pytest.MonkeyPatch) -> None:
     _, drives, sims = che_drives(2)
     sims[1].trip(4)
     noted = NotedCalls(drives)
@@ -361,15 +361,6 @@ def test_a_ramp_to_a_forbidden_setpoint_sends_no_step(model: str) -> None:
     assert len(line.written) == 1
 
 
-def test_a_ramp_above_the_drive_s_limit_is_refused_before_its_first_step() -> None:
-    line, drive, _ = one(YD1000(1))
-    drive.set_frequency(10)
-    line.frames.clear()
-    with pytest.raises(WriteForbidden, match=r"82\.50 Hz is above maximum_frequency, which is 80 Hz"):
-        ramp(drive, 82.5)
-    assert line.written == []
-
-
 def test_a_ramp_starts_from_a_setpoint_of_a_plain_write() -> None:
     """The setpoint cannot be read. A ramp from the older setpoint would start with a jump."""
     line, drive, _ = one(InnovertIBD(1, confirmed=1))
@@ -410,15 +401,6 @@ class ShareToy(Toy):
         yield from self._write_setpoint(self.share, hz / 80 * 100)
 
 
-def test_a_ramp_of_a_percentage_of_an_unknown_maximum_is_refused() -> None:
-    line = SimulatedBus(simulated(ShareToy(1)))
-    with pytest.raises(
-        WriteForbidden, match=r"is in %: a ramp needs maximum_frequency, which is not declared"
-    ):
-        ramp(line.attach(ShareToy(1, name="toy")), 20.0, rate=5.0)
-    assert line.written == []
-
-
 class AliasToy(Toy):
     """A drive whose setpoint is kept in EEPROM, but is written at an alias address in RAM."""
 
@@ -441,23 +423,6 @@ def test_a_ramp_through_a_ram_alias_writes_no_eeprom(tmp_path: Path) -> None:
     assert Ledger(tmp_path / "wear.sqlite").wear(0) == []
 
 
-def test_a_ramp_from_an_unknown_setpoint_is_refused() -> None:
-    line = SimulatedBus()
-    toy = line.attach(Toy(1, name="toy"))
-    with pytest.raises(
-        WriteForbidden, match=r"^toy cannot report its setpoint: call set_frequency before a ramp$"
-    ):
-        ramp(toy, 20.0, rate=5.0)
-    assert line.frames == []
-
-
-def test_a_ramp_of_a_setpoint_in_eeprom_is_refused() -> None:
-    line, drive, _ = one(DelixiModbus(1))
-    with pytest.raises(WriteForbidden, match="EEPROM"):
-        ramp(drive, 20.0)
-    assert line.written == []
-
-
 class KeptToy(Toy):
     """A drive whose setpoint is declared as a command, but is kept in EEPROM."""
 
@@ -468,11 +433,24 @@ class KeptToy(Toy):
         yield from self._write_setpoint(self.frequency, hz)
 
 
-def test_a_ramp_to_a_command_in_eeprom_is_refused_before_its_first_step() -> None:
-    line = SimulatedBus(simulated(KeptToy(1)))
-    toy = line.attach(KeptToy(1))
-    toy.set_frequency(5)
+@table(
+    ("drive", "before", "rate", "error"),
+    [
+        (YD1000(1), 10, None, r"82\.50 Hz is above maximum_frequency, which is 80 Hz"),
+        (ShareToy(1), None, 5.0, "is in %: a ramp needs maximum_frequency, which is not declared"),
+        (Toy(1), None, 5.0, r"^toy@1 cannot report its setpoint: call set_frequency before a ramp$"),
+        (DelixiModbus(1), None, None, "EEPROM"),
+        (KeptToy(1), 5, 5.0, "which a ramp would wear out"),
+    ],
+)
+def test_a_refused_ramp_sends_no_step(
+    drive: Any, before: float | None, rate: float | None, error: str
+) -> None:
+    line = SimulatedBus(simulated(drive))
+    line.attach(drive)
+    if before:
+        drive.set_frequency(before)
     line.frames.clear()
-    with pytest.raises(WriteForbidden, match="which a ramp would wear out"):
-        ramp(toy, 20.0, rate=5.0)
+    with pytest.raises(WriteForbidden, match=error):
+        ramp(drive, 82.5, rate=rate)
     assert line.written == []

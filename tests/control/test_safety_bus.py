@@ -402,7 +402,7 @@ def test_a_register_declared_as_ram_is_not_counted(tmp_path: Path) -> None:
 
 def test_a_write_through_a_ram_alias_is_not_counted_as_an_eeprom_write(tmp_path: Path) -> None:
     class Mine(InvtCHE):
-        """A CHE with a parameter declared by its owner."""
+        """An INVT CHE with a parameter declared by its owner."""
 
         acceleration_time = parameter(12, "s", step=0.1, place="P0.07")
 

@@ -104,8 +104,8 @@ BROADCASTS = {  # (function, register address, value) of each allowed broadcast
     (6, 0x1000, 0xC000),
     (6, 0x1000, 0x8000),
     (6, 0x1001, 0),
-    (6, 0x2000, 0),  # CHE
-    (6, 0x2000, 1),  # IBD, Delixi
+    (6, 0x2000, 0),  # INVT CHE
+    (6, 0x2000, 1),  # INNOVERT IBD, Delixi
     (6, 0x2001, 0),
     (2, 1, 0),
 }

@@ -292,7 +292,7 @@ SAYS: dict[str, bytes] = {
     "an exception of the other drive": rtu("02 86 12"),
     "an exception to another function": rtu("01 83 02"),
 }
-FAILURES = {"ours with one bit turned": DriveException}  # a CHE answers this frame with exception 11H
+FAILURES = {"ours with one bit turned": DriveException}  # an INVT CHE answers this with exception 11H
 PULSES = {"start": START, "jog": JOG, "reset_fault": RESET}
 
 

@@ -170,7 +170,7 @@ def test_a_process_that_extends_its_mastership_in_time_is_not_killed() -> None:
 @pytest.mark.parametrize(
     "end", ["mastership.end()", "del mastership; import gc; gc.collect(); mastership = Mastership()"]
 )
-def test_a_process_that_ended_its_mastership_is_not_killed(end: str) -> None:
+def test_a_process_that_gave_up_its_right_to_send_is_not_killed(end: str) -> None:
     with keeper(1.0, 0.2, f"{end}; time.sleep(1.5)") as process:
         assert until_of(process) == 0
         assert process.poll() is None

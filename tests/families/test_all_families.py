@@ -82,7 +82,7 @@ def test_invalid_drive_address_is_refused(family: type[Drive], given: object) ->
         family(given)  # type: ignore[arg-type]
 
 
-TERMINALS = {  # names of the RS-485 terminals in each manual; the CHE's manual has none
+TERMINALS = {  # names of the RS-485 terminals in each manual; the INVT CHE's manual has none
     "erman-er-g-220": "485A and 485B",
     "innovert-ibd": "RS+ and RS-",
     "delixi-modbus": "SG+ and SG-",

@@ -192,7 +192,7 @@ HAZARDS = {
     "E18: nothing is broadcast, because drives may reply": Hazard(
         erman, broadcast("frequency", 0.0), naive="00 06 00 02 00 00", refuses="no harmless broadcast"
     ),
-    # ---- 2: CHE ----
+    # ---- 2: INVT CHE ----
     "I1: no ordinal is computed: P0.07 has no address here": Hazard(
         che,
         lambda line, drive, sim: drive.register("acceleration_time"),
@@ -215,7 +215,7 @@ HAZARDS = {
     "2.7: the setpoint goes before the start": Hazard(
         che, start, naive="01 06 10 00 00 01", refuses="set_frequency"
     ),
-    # ---- 3: IBD ----
+    # ---- 3: INNOVERT IBD ----
     "N1: what Prb.01 means is contradictory": Hazard(
         ibd,
         write("frequency_source", FrequencySource.LINE),
@@ -393,7 +393,7 @@ def test_erman_state_is_decoded_from_either_word_erratum_e9_e10() -> None:
     assert [ErmanERG220.status.decode(number) for number in range(4)] == list(ErmanStatus)[:4]
 
 
-def test_erman_diagnostics_and_unknown_addresses_are_not_used_erratum_e13_e16() -> None:
+def test_erman_declares_neither_diagnostics_nor_unknown_addresses_erratum_e13_e16() -> None:
     assert {register.table.read for register in ErmanERG220.registers.values()} <= {1, 3, 4}
     assert max(register.address for register in ErmanERG220.registers.values()) == 0x0402
     assert all(
@@ -401,7 +401,7 @@ def test_erman_diagnostics_and_unknown_addresses_are_not_used_erratum_e13_e16() 
     )
 
 
-def test_request_refused_as_damaged_by_a_che_is_repeated_erratum_i4() -> None:
+def test_request_refused_as_damaged_by_an_invt_che_is_repeated_erratum_i4() -> None:
     line, drive, _ = one(InvtCHE(1))
     line.refuses = lambda request: 0x11 if len(line.frames) == 1 else 0
     assert drive.read(drive.output_frequency) == 0
@@ -435,12 +435,12 @@ def test_erman_function_08_has_a_subfunction_of_two_bytes_erratum_e14() -> None:
     assert build_request(Framing.RTU, Message(1, 8, 0x0000, data=b"\xa5\x37")).hex(" ").upper() == printed
 
 
-def test_user_can_choose_parity_and_stop_bits_of_a_che_erratum_i3() -> None:
+def test_user_can_choose_parity_and_stop_bits_of_an_invt_che_erratum_i3() -> None:
     assert {"8N1", "8N2", "8E1", "8E2"} <= set(InvtCHE.formats[Framing.RTU])
     assert InvtCHE(1, format="8E2").settings.format == "8E2"
 
 
-def test_unexplained_example_of_the_che_manual_cannot_be_sent_erratum_i6() -> None:
+def test_unexplained_example_of_the_invt_che_manual_cannot_be_sent_erratum_i6() -> None:
     assert not [register for register in InvtCHE.registers.values() if register.address == 0x0008]
 
 

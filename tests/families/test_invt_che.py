@@ -243,7 +243,7 @@ def test_che_stop_that_is_refused_at_rest_counts_as_done() -> None:
     assert wire.reads == ["status"] * 2
 
 
-def test_che_coast_and_reset_send_the_documented_words() -> None:
+def test_invt_che_coast_and_reset_send_the_documented_words() -> None:
     wire = Wire(InvtCHE(1), STANDBY)
     wire.drive.coast()
     wire.drive.reset_fault()

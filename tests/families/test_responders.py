@@ -117,7 +117,7 @@ SHEETS = {
         (0x1000, 7),
         before_reset=(),
     ),
-    # IBD manual p. 128 to 134: outputs programmed as in the example; PrA.22 has bits 11 and 12 set.
+    # INNOVERT IBD manual p. 128 to 134: outputs programmed as in the example; PrA.22 has bits 11 and 12 set.
     "innovert-ibd": Sheet(
         {22: 0x1800, 101: 5, 102: 2, 108: 100, 323: 1, 324: 7, 325: 8, 328: 3, 700: 1, 702: 1, 3: 0, 4: 0},
         {"output_current": 2.5},

@@ -152,7 +152,7 @@ def replace_data(request: Any, value: int) -> Any:
 
 
 def test_goodrive_declared_as_a_confirmed_innovert_ibd_does_not_run() -> None:
-    """The owner had confirmed the drive as an IBD before a Goodrive replaced it."""
+    """The owner had confirmed the drive as an INNOVERT IBD before a Goodrive replaced it."""
     sim: Any = simulated(shipped("invt-goodrive", 1))
     bus = SimulatedBus(sim)
     drive = bus.attach(InnovertIBD(1, confirmed=1))
@@ -175,7 +175,7 @@ def test_delta_drive_declared_as_a_goodrive_is_stopped_but_gets_no_coast() -> No
     assert pair.bus.written != []
 
 
-def test_error_for_a_chf100a_declared_as_a_che_names_the_right_model() -> None:
+def test_error_for_a_chf100a_declared_as_an_invt_che_names_the_right_model() -> None:
     pair = Pair("invt-che", "invt-chf100a", turns=True)
     with pytest.raises(WriteForbidden, match="declare model invt-chf100a"):
         pair.drive.start()

@@ -286,7 +286,7 @@ def test_stop_while_the_plan_is_read_cancels_all_writes(monkeypatch: pytest.Monk
     assert {frame[6:11] for frame in line.written} == {"20 00"}  # the only write is the stop
 
 
-# free bytes on the disk: in each row, the disk becomes full at another record
+# room: bytes until the disk is full. In each row, writing another line of the journal fails.
 @table("room", [0, 100, 130, 160, 200, 230])
 def test_the_apply_after_a_full_disk_completes_the_writes(monkeypatch: pytest.MonkeyPatch, room: int) -> None:
     line, drive, _ = attached(ErmanERG220(1), [])

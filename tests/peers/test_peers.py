@@ -112,7 +112,7 @@ def test_registers_and_coils_of_other_servers_are_read(server: Server) -> None:
 
 @pytest.mark.slow
 @patient
-def test_undeclared_registers_of_other_servers_can_be_read(server: Server) -> None:
+def test_read_raw_reads_undeclared_registers_of_pymodbus_and_libmodbus(server: Server) -> None:
     """Check that undeclared registers and coils have the values that the server's source defines."""
     with Bus(server.port) as bus:
         device = server.attach(bus)

@@ -94,7 +94,7 @@ def test_prediction_includes_a_shorter_silence_declared_for_a_drive() -> None:
 
 
 def test_prediction_includes_10_ms_of_silence_before_and_after_an_innovert_ibd() -> None:
-    """In a cycle of three drives, two of the three silences are those of the IBD, which are the longest."""
+    """In a cycle of three drives, two of the three silences are those of the INNOVERT IBD."""
     che, other, ibd = InvtCHE(1, format="8N1"), InvtCHE(2, format="8N1"), InnovertIBD(3)
     exchanges = [asked(one, None, "output_current") for one in (che, other, ibd)]
     found = predict([one for each in exchanges for one in each])

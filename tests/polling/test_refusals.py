@@ -20,7 +20,7 @@ from toy import Picky, Toy, expected_values, family
 
 from multidrop.core import Message, NumberFormat
 from multidrop.drive import Drive
-from multidrop.drive.register import HOLDING, HOLDING_MULTIPLE, INPUT, reading, setting
+from multidrop.drive.register import HOLDING, INPUT, reading
 from multidrop.planning.blocks import blocks, halves
 from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
 from multidrop.poller import Poller
@@ -152,12 +152,15 @@ def test_probes_of_a_device_that_ignores_long_requests_keep_the_rate() -> None:
     assert max(Counter(sim.asked).values()) <= 2 * 600 / 5  # r0 is read by the probe, and later in a block
 
 
-@pytest.mark.long
-def test_blocks_of_a_dead_drive_are_not_split() -> None:
+@pytest.mark.slow
+@pytest.mark.parametrize("answered_s", [0, 3])
+def test_blocks_of_a_silent_drive_are_not_split(answered_s: int) -> None:
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive)
-    sim.deaf_until = float("inf")
+    sim.deaf_until = 0.0 if answered_s else float("inf")
     with clocked_line_of(drive, sim) as clocked:
+        clocked.run(answered_s)
+        sim.deaf_until = float("inf")
         clocked.run(120)
         sim.deaf_until = 0.0
         clocked.run(10)
@@ -165,21 +168,6 @@ def test_blocks_of_a_dead_drive_are_not_split() -> None:
         rows = clocked.run(5)
     assert set(sim.asked) == {(0, WIDE)}
     assert values(rows) == expected_values(range(WIDE))
-
-
-@pytest.mark.slow
-def test_blocks_of_a_drive_that_falls_silent_are_not_split() -> None:
-    drive = family(WIDE)(1, name="pump-1")
-    sim = Picky(drive)
-    with clocked_line_of(drive, sim) as clocked:
-        clocked.run(3)
-        sim.deaf_until = float("inf")
-        clocked.run(60)
-        sim.deaf_until = 0.0
-        clocked.run(10)
-        sim.asked.clear()
-        clocked.run(5)
-    assert set(sim.asked) == {(0, WIDE)}
 
 
 @pytest.mark.long
@@ -377,19 +365,6 @@ def test_a_no_value_code_is_a_miss_with_its_reason() -> None:
     counted = sum(row.status == "no valid value" for row in rows)
     assert statistics.misses["no valid value"] == counted > 0
     assert statistics.samples == sum(row.status == "ok" for row in rows)
-
-
-def test_registers_written_by_function_16_are_read_together_with_other_registers() -> None:
-    class Controller(Drive):
-        """A drive with a register that only function 16 writes."""
-
-        most_registers = {HOLDING: 10, HOLDING_MULTIPLE: 10}
-        level = reading(0, "m")
-        target = setting(1, "m", table=HOLDING_MULTIPLE)
-
-    sim = SimulatedDrive(Controller(1))
-    sim["level"], sim["target"] = 3, 4
-    assert sim.read(3, 0, 2) == [3, 4]
 
 
 ILLEGAL_ADDRESS, ILLEGAL_VALUE = 2, 3

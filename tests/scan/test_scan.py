@@ -334,16 +334,14 @@ def test_drive_with_a_long_response_delay_is_found(delay: float) -> None:
 
 
 class Hesitant(SimulatedCHE):
-    """A CHE that replies fast to the sweep and its probe, then slowly, like a busy converter or computer."""
-
-    hurried = 3  # number of fast replies to the probe, after the fast reply to the sweep
+    """An INVT CHE that replies fast to its first four requests, then slowly, like a busy converter."""
 
     @property
     def delay(self) -> float:
-        return super().delay if self.counters.requests <= 1 + self.hurried else 0.4
+        return super().delay if self.counters.requests <= 4 else 0.4
 
 
-def test_drive_that_becomes_slow_during_its_probe_is_identified() -> None:
+def test_drive_that_becomes_slow_during_a_scan_is_identified() -> None:
     line = Line(Pair([Hesitant(InvtCHE(3))]))
     plan = sweeps([InvtCHE], baudrates=[9600], formats=["8N1"])
     assert drives(found(line, plan, FAMILIES)) == declared(InvtCHE(3))
@@ -521,7 +519,7 @@ def test_every_sweep_reads_a_register_of_its_families() -> None:
 
 
 class Bare(SimulatedIBD):
-    """An IBD with only the registers below address 200, which the manual's examples show."""
+    """An INNOVERT IBD with only the registers below address 200, which the manual's examples show."""
 
     def read(self, function: int, start: int, count: int) -> list[int]:
         if start >= 200:

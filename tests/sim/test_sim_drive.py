@@ -12,6 +12,7 @@ from multidrop.drive.register import (
     COIL,
     DISCRETE,
     HOLDING,
+    HOLDING_MULTIPLE,
     INPUT,
     Kept,
     Register,
@@ -100,6 +101,19 @@ def test_value_set_on_a_simulated_drive_is_read_over_the_line(
 
 def test_simulated_drive_returns_factory_values_and_0_in_readable_gaps(sim: SimulatedDrive) -> None:
     assert data_of(ask(sim, 3, 0x10, 4)) == "00 32 00 00 00 00 00 00"
+
+
+def test_one_read_returns_registers_that_different_functions_write() -> None:
+    class Controller(Drive):
+        """A drive with a register that only function 16 writes."""
+
+        most_registers = {HOLDING: 10, HOLDING_MULTIPLE: 10}
+        level = reading(0, "m")
+        target = setting(1, "m", table=HOLDING_MULTIPLE)
+
+    sim = SimulatedDrive(Controller(1))
+    sim["level"], sim["target"] = 3, 4
+    assert sim.read(3, 0, 2) == [3, 4]
 
 
 def test_register_written_to_a_simulated_drive_is_read_back_and_recorded(sim: SimulatedDrive) -> None:

@@ -187,18 +187,18 @@ def che() -> Bench:
     return Bench(MyCHE(1, maximum_frequency=60))
 
 
-def test_simulated_che_device_code_register_reads_0101h(che: Bench) -> None:
+def test_simulated_invt_che_device_code_register_reads_0101h(che: Bench) -> None:
     assert che.exchange("01 03 30 16 00 01 6A CE")[:14] == "01 03 02 01 01"
 
 
-def test_simulated_che_stores_a_written_parameter() -> None:
+def test_simulated_invt_che_stores_a_written_parameter() -> None:
     che = Bench(MyCHE(2))
     frame = "02 06 00 08 13 88 05 6D"  # the example of section 11.6.2
     assert che.exchange(frame) == frame
     assert che.sim["jump"] == 0x1388
 
 
-def test_simulated_che_setpoint_is_a_percentage_of_the_maximum_frequency(che: Bench) -> None:
+def test_simulated_invt_che_setpoint_is_a_percentage_of_the_maximum_frequency(che: Bench) -> None:
     che.exchange("01 06 20 00 13 88 8F 5C")  # 50.00 %
     che.exchange("01 06 10 00 00 01 4C CA")
     che.wait(60)
@@ -207,7 +207,7 @@ def test_simulated_che_setpoint_is_a_percentage_of_the_maximum_frequency(che: Be
     assert che.read(3, 0x1001) == [1]
 
 
-def test_simulated_che_runs_in_reverse_at_a_negative_setpoint(che: Bench) -> None:
+def test_simulated_invt_che_runs_in_reverse_at_a_negative_setpoint(che: Bench) -> None:
     assert che.write(0x2000, 0x10000 - 5000) == 0
     che.write(0x1000, 1)
     che.wait(60)
@@ -217,7 +217,7 @@ def test_simulated_che_runs_in_reverse_at_a_negative_setpoint(che: Bench) -> Non
 
 
 @pytest.mark.parametrize(("word", "stopped_after"), [(5, False), (6, True), (8, False)])
-def test_simulated_che_ramps_down_at_a_stop_and_coasts(che: Bench, word: int, stopped_after: bool) -> None:
+def test_simulated_invt_che_ramps_down_or_coasts(che: Bench, word: int, stopped_after: bool) -> None:
     che.write(0x2000, 10_000)
     che.write(0x1000, 2)
     che.wait(60)
@@ -229,7 +229,7 @@ def test_simulated_che_ramps_down_at_a_stop_and_coasts(che: Bench, word: int, st
     assert che.read(3, 0x1001) == [3]
 
 
-def test_simulated_che_refuses_a_start_during_a_fault_until_a_reset(che: Bench) -> None:
+def test_simulated_invt_che_refuses_a_start_during_a_fault_until_a_reset(che: Bench) -> None:
     che.sim.trip(10)
     assert (che.read(3, 0x1001), che.read(3, 0x5000)) == ([4], [10])
     assert che.write(0x1000, 1) == 0x01  # the manual uses this code also for a command during a fault
@@ -247,19 +247,11 @@ def test_simulated_che_refuses_a_start_during_a_fault_until_a_reset(che: Bench) 
         ("01 04 30 00 00 01", "01 84 01"),
     ],
 )
-def test_simulated_che_refuses_requests_with_documented_exceptions(che: Bench, body: str, reply: str) -> None:
+def test_simulated_invt_che_refuses_requests_as_documented(che: Bench, body: str, reply: str) -> None:
     assert che.send(checksums.rtu(body)) == checksums.rtu(reply)
 
 
-def test_value_of_a_simulated_drive_can_be_set_by_name_or_as_text(che: Bench) -> None:
-    for _ in range(3):
-        che.write(11, 50)
-    che.write(0x800B, 70)
-    assert che.sim["acceleration_time"] == 7
-    assert che.sim.counters.eeprom_writes == {"acceleration_time": 3}
-
-
-def test_simulated_che_refuses_a_write_while_it_stores_the_previous_one(che: Bench) -> None:
+def test_simulated_invt_che_refuses_a_write_while_it_stores_the_previous_one(che: Bench) -> None:
     assert isinstance(che.sim, SimulatedCHE)
     che.sim.storing = 0.5
     assert che.write(11, 50) == 0
@@ -269,7 +261,7 @@ def test_simulated_che_refuses_a_write_while_it_stores_the_previous_one(che: Ben
     assert che.write(11, 60) == 0
 
 
-def test_simulated_che_refuses_to_change_a_locked_parameter_while_running(che: Bench) -> None:
+def test_simulated_invt_che_refuses_to_change_a_locked_parameter_while_running(che: Bench) -> None:
     che.write(0x2000, 5000)
     assert che.write(12, 1) == 0
     che.write(0x1000, 1)
@@ -277,7 +269,7 @@ def test_simulated_che_refuses_to_change_a_locked_parameter_while_running(che: B
     assert che.sim["locked"] == 1
 
 
-def test_simulated_che_replies_to_a_damaged_frame_with_exception_11h(che: Bench) -> None:
+def test_simulated_invt_che_replies_to_a_damaged_frame_with_exception_11h(che: Bench) -> None:
     assert che.send(bytes.fromhex("01 03 10 01 00 01 D1 0B")) == checksums.rtu("01 83 11")
     assert che.send(bytes.fromhex("02 03 10 01 00 01 D1 0B")) == b""
     assert che.sim.counters.damaged == 1
@@ -693,12 +685,12 @@ def test_preset_speed_bits_of_a_simulated_yd1000_select_the_speed(yd: Bench, bit
 @pytest.mark.parametrize(
     ("address", "value"),
     [
-        (0x0012, 8001),  # limits of UL: 0.5 Hz to FH
+        (0x0012, 8001),  # UL, the upper frequency limit: 0.5 Hz to FH
         (0x0012, 49),
-        (0x0013, 8001),  # limits of LL: 0 Hz to UL
-        (0x0018, 8001),  # limits of Sr1: LL to UL
-        (0x0100, 8001),  # limits of F100: 0 Hz to FH
-        (0x1001, 8001),  # limits of 1001H: 0 Hz to FH
+        (0x0013, 8001),  # LL, the lower frequency limit: 0 Hz to UL
+        (0x0018, 8001),  # Sr1, preset speed 1: LL to UL
+        (0x0100, 8001),  # F100, the low-speed frequency: 0 Hz to FH
+        (0x1001, 8001),  # the setpoint: 0 Hz to FH
         (0x1002, 8001),
         (0x0802, 64),
         (0x0803, 101),
@@ -720,7 +712,7 @@ def test_limits_of_a_simulated_yd1000_follow_other_parameters(yd: Bench) -> None
 
 
 @pytest.mark.parametrize("address", [0x0001, 0x0007, 0x0015])
-def test_simulated_yd1000_does_not_store_the_panels_setpoint(yd: Bench, address: int) -> None:
+def test_simulated_yd1000_does_not_store_parameters_of_its_panel(yd: Bench, address: int) -> None:
     assert yd.write(address, 1) == 0
     assert yd.read(3, address) == [0]
     assert not yd.sim.counters.eeprom_writes

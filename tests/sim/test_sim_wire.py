@@ -58,7 +58,7 @@ def test_each_simulated_byte_arrives_at_its_last_bit_or_slightly_later(baudrate:
 @table("family", [ErmanERG220, InvtCHE, InnovertIBD, DelixiModbus, YD1000])
 @table("extra", [b"\0", b"\x01\x03", b"\xff\xff\xff"])
 def test_simulated_drive_ignores_a_frame_followed_by_more_bytes(family: type[Drive], extra: bytes) -> None:
-    """The manuals allow no byte after the checksum (ERMAN, section 5; CHE, 11.5; YD1000, section 5)."""
+    """The manuals allow no byte after the checksum (ERMAN, section 5; INVT CHE, 11.5; YD1000, section 5)."""
     wire = Wire([simulated(family(1))])
     register = next(each for each in wire.drives[0].drive.readings() if each.step is not None)
     good = checksums.rtu(f"01 {register.table.read:02X} {register.address:04X} 00 01")

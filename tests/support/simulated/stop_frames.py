@@ -109,7 +109,7 @@ class Meanwhile:
 def che_drives(
     count: int = 1, *, hz: float = 20, runs_s: float | None = None
 ) -> tuple[SimulatedBus, list[Any], list[Any]]:
-    """Return a simulated bus, its CHE drives, whose setpoints are written, and their simulations.
+    """Return a simulated bus, its INVT CHE drives, whose setpoints are written, and their simulations.
 
     If `runs_s` is given, all motors have been running for this many seconds.
     """
