@@ -215,9 +215,9 @@ class Bus:
                 self._records.close()
                 self._attached.free()
 
-    def tended(self, is_tended: bool) -> None:
-        """Set whether a poller reopens a lost port; if not, stops reopen it."""
-        self._stopper.is_tended = is_tended
+    def note_reopening(self, is_under_way: bool) -> None:
+        """Set whether a poller is reopening the lost port now; if not, stops reopen it."""
+        self._stopper.is_reopening = is_under_way
 
     # ---- the drives ----
 

@@ -217,8 +217,7 @@ class Poller(RowSource):
 
     def _run(self) -> None:
         try:
-            with self._lines.tended():
-                self._poll()
+            self._poll()
         except BaseException as failure:  # any failure: polling must not end silently
             self.failure = PollingFailed(f"polling has ended on all lines: {words_of(failure)}")
             self.failure.__cause__ = failure

@@ -103,6 +103,19 @@ def test_stop_all_reports_failed_if_neither_broadcast_nor_stop_was_sent(models: 
     assert {told.seen for told in line.bus.stop_all(seconds=1.0).values()} == {Seen.FAILED}
 
 
+@pytest.mark.parametrize("seconds", [0, 0.05])
+def test_a_stop_with_a_short_time_limit_is_sent_to_each_drive_after_the_broadcast(
+    monkeypatch: pytest.MonkeyPatch, seconds: float
+) -> None:
+    """Noise may damage the broadcast, which no drive answers."""
+    line, _, sims = che_drives(monkeypatch, 5, runs_s=20)
+    line.deafens = lambda request: request.address == 0
+    line.bus.stop_all(seconds)
+    assert len(broadcasts(line)) == 1
+    line.sleep(60)
+    assert all_stopped(line, sims)
+
+
 class Quiet(Toy):
     """A drive whose only broadcast does not stop the motor."""
 

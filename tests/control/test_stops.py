@@ -367,7 +367,7 @@ def test_a_stop_reopens_a_lost_port_unless_a_poller_does(tended: bool) -> None:
         return None
 
     line.is_lost, line.answers, vars(line)["regain"] = True, lost, regain
-    line.bus.tended(tended)
+    line.bus.note_reopening(tended)
     with pytest.raises(LineError):
         drive.read(drive.status)
     opened.clear()  # the read has tried to open the port: not counted

@@ -302,7 +302,7 @@ def test_an_unsent_stop_is_not_recorded_as_sent(tmp_path: Path) -> None:
         drive = bus.attach(MAKE["invt-che"](1))
         drive.set_frequency(20)
         before = [*read_audit(audit)]
-        bus.tended(True)
+        bus.note_reopening(True)
         bus.line.drop()
         with pytest.raises(PortLost):
             drive.stop(seconds=0)

@@ -1,4 +1,4 @@
-"""A stop reopens a polled line's lost port if no thread of the poller can do so."""
+"""Lost ports of polled lines are reopened by the poller and by stops; neither prevents a stop."""
 
 from __future__ import annotations
 
@@ -13,15 +13,16 @@ from pathlib import Path
 import pytest
 from clocked_lines import ClockedLines, ClockedWire
 from examples import usually
-from lines import line, plant, polled, rows_of, until
+from lines import PATIENCE, line, plant, polled, rows_of, until
 from tables import table
-from toy import Toy
+from toy import Status, Toy
 
 from multidrop import poller as poller_module
+from multidrop.bus import Bus
 from multidrop.core import Framing, Message, build_reply, parse_request
-from multidrop.drive import Drive
-from multidrop.drive.register import HOLDING, reading
-from multidrop.drive.verbs import CommandOutcome
+from multidrop.drive import Drive, Script, insist, read
+from multidrop.drive.register import HOLDING, command, reading
+from multidrop.drive.verbs import CommandOutcome, verb
 from multidrop.errors import LineError, PollingFailed
 from multidrop.families import InvtCHE
 from multidrop.poller import Poller
@@ -138,6 +139,28 @@ def test_a_stop_of_a_failed_poller_reopens_its_port(hall: Plant, monkeypatch: py
         hall.poller.close()
 
 
+def test_a_stop_reopens_a_port_between_two_attempts_of_the_poller(
+    hall: Plant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(polled_line, "REOPEN_NS", 3_600_000_000_000)
+    lost = hall.poller._lines.find("hall")
+    until(lambda: lost._tried_ns and not lost._reopening.is_under_way)
+    hall.stack.enter_context(hall.there())
+    hall.stop()
+
+
+def test_a_port_that_a_stop_has_reopened_is_not_dropped_as_lost(
+    hall: Plant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The poller may notice the loss of the earlier port just after a stop has reopened the port."""
+    until(lambda: hall.port.is_lost)
+    hall.stack.enter_context(hall.there())
+    until(lambda: not hall.port.is_lost)
+    reopened = hall.port.queue
+    hall.port.drop_lost()
+    assert hall.port.queue is reopened is not None
+
+
 @contextmanager
 def server(
     is_last: Callable[[int, int], bool], idle_s: float | None = None, closes: list[bytes] | None = None
@@ -252,6 +275,37 @@ class Fragile(Toy):
     framings = (Framing.TCP,)
     formats = {Framing.TCP: ("8N1",)}
     deadly = reading(DEADLY)
+
+
+class Checked(Fragile):
+    """A drive whose identity is checked with two reads before the first stop."""
+
+    control = command(0x14, Status, harmless=(0,))
+
+    @verb
+    def identify(self) -> Script[None]:
+        """Read two registers."""
+        yield from read(self.fault)
+        yield from read(self.mystery)
+
+    @verb
+    def stop(self) -> Script[None]:
+        """Stop the motor, and read whether it stands."""
+        yield from insist(self.control, Status(0))
+        yield from read(self.output_frequency)
+
+
+@pytest.mark.parametrize("is_polled", [False, True])
+def test_a_stop_is_sent_although_the_server_closes_the_connection_after_each_reply(is_polled: bool) -> None:
+    """The check of the drive's family must not use up each new connection, and neither must polling."""
+    drive = Checked(1, name="pump")
+    with server(lambda nth, address: True) as port, ExitStack() as stack:
+        if is_polled:
+            polls = polled(drive, [Checked.output_current, Checked.status])
+            stack.enter_context(Poller(plant(line(port, polls))))
+        else:
+            stack.enter_context(Bus(port)).attach(drive)
+        assert drive.stop(seconds=PATIENCE).outcome is CommandOutcome.DONE
 
 
 def test_a_stop_does_not_wait_for_the_poller_to_reopen_a_port(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,11 +12,11 @@ from decimal import Decimal
 from functools import partial
 from math import inf, nan
 from numbers import Real
-from typing import Any
+from typing import Any, TypeVar
 
 from multidrop.control.call import Latches
 from multidrop.control.outcome import Outcome, Seen, Stopped, result_of_stop
-from multidrop.control.writer import Writer
+from multidrop.control.writer import Checked, Writer
 from multidrop.core import Message
 from multidrop.drive.family import Drive
 from multidrop.drive.verbs import CommandResult, Pulse, Read, Script, Step, Wait, Write
@@ -49,10 +49,11 @@ WORTH_REPEATING = (Unconfirmed, NotVerified, NoReply, BadReply, DriveException, 
 UNANSWERED = (Unconfirmed, NoReply, BadReply)
 # errors after which stops are retried: the system may soon have memory or descriptors again
 NO_ROOM = (MemoryError, OSError)
-REGAIN_NS = 500_000_000  # interval at which stops try to reopen a lost port
+REGAIN_NS = 500_000_000  # interval between a failed attempt to reopen a lost port and the next one
 
 _log = logging.getLogger("multidrop.control")
 
+R = TypeVar("R")
 Do = Callable[["StopAttempt", Step], Any]
 
 
@@ -93,6 +94,7 @@ class StopAttempt:
         self._pulses: set[tuple[str, Any]] = set()
         self._has_warned = False
         self.doubt = ""  # why the drive may be of another family
+        self.checked: Checked = set()
         self._shows_more_than_zeros = True  # False if all reads since the last write returned 0
         self._begin()
 
@@ -114,7 +116,9 @@ class StopAttempt:
     def advance(self, do: Do, now: Callable[[], float]) -> bool:
         """Carry out one step; return True if the stop is over."""
         limit = self._seconds
-        if limit is not None and self.is_sent and now() >= self._begun + limit:
+        # a broadcast alone does not end the stop: the drive may not have received it
+        is_tried = self.is_sent and self.frame is not None
+        if limit is not None and is_tried and now() >= self._begun + limit:
             reason = f"it was not seen to stop within its {limit:g} s"
             self.failure = self.failure or Unconfirmed(self.drive.name, "the stop", reason)
             return True
@@ -427,12 +431,11 @@ class StopRun:
 class Stopper:
     """Stops the drives of one bus.
 
-    If `is_tended` is set, a poller reopens a lost port, and stops wait until the port is open again.
-    Otherwise the stops reopen the port.
+    While `is_reopening` is set, a poller is opening a lost port, and stops do not open it themselves.
     """
 
     def __init__(self, exchanges: Exchanges, writer: Writer, latches: Latches) -> None:
-        self.is_tended = False
+        self.is_reopening = False
         self.latches = latches
         self.records = writer.records
         self.under_way: dict[StopRun, list[StopAttempt]] = {}
@@ -467,34 +470,54 @@ class Stopper:
 
     def do(self, stop: StopAttempt, step: Step) -> Any:
         """Carry out a step of a stop. The first write never waits for a late reply; later writes may."""
-        self._regain()
+        return self._on_open_port(lambda: self._carry_out(stop, step))
+
+    def _carry_out(self, stop: StopAttempt, step: Step) -> Any:
         if isinstance(step, Read):  # a read has one attempt: without a reply, the stop is sent again instead
             return self._exchanges.value(stop.drive, step.register, 1)
         assert isinstance(step, Write)
         timeout = WRITE_TIMEOUT if stop.is_sent else 0.0
         try:
-            return self._writer.insist(stop.drive, step, timeout, stop.note_frame).value
+            return self._writer.insist(stop.drive, step, stop.checked, timeout, stop.note_frame).value
         finally:
             stop.doubt = self._writer.identity_check.doubt(stop.drive)
 
     def insist(self, drive: Drive, step: Write) -> Outcome:
         """Write a count that stops the motor, after reopening a lost port; return the outcome."""
-        self._regain()
+        checked: Checked = set()
+
+        def write() -> Outcome:
+            return self._writer.insist(drive, step, checked)
+
         try:
-            return self._writer.insist(drive, step)
+            return self._on_open_port(write)
         except CheckAgain:  # check again immediately, because no other stop waits
-            return self._writer.insist(drive, step)
+            return self._on_open_port(write)
 
     def ready(self, drive: Drive) -> float:
         """Return the time (in s) before which no request may be sent to the drive."""
         peer = self._exchanges.peers.present.get(drive)
         return peer.ready_ns / 1e9 if peer else 0.0
 
+    def _on_open_port(self, act: Callable[[], R]) -> R:
+        """Reopen a lost port and carry out `act`. If the port is lost then, do both once more.
+
+        Some servers close the connection after each reply. A write that may have been sent raises
+        Unconfirmed, and is not repeated here.
+        """
+        self._regain()
+        try:
+            return act()
+        except PortLost:
+            self._regain()
+            return act()
+
     def _regain(self) -> None:
         line, now = self._exchanges.line, clock.now_ns()
-        if not self.is_tended and line.is_lost and now >= self._regain_ns and line.may_send:
+        if not self.is_reopening and line.is_lost and now >= self._regain_ns and line.may_send:
             self._regain_ns = now + REGAIN_NS
             line.regain()
+            self._regain_ns = 0  # the interval applies only after a failure
 
 
 def _due(stop: StopAttempt) -> float:

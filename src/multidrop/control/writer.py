@@ -35,6 +35,9 @@ from multidrop.transport.exchange import READ_FAILURES, Exchanges, good_reply
 
 ACKNOWLEDGED = 5  # exception code: the device accepted the request, but needs more time
 
+# the writes (register's name and raw count) of one stop before which the drive's family was checked
+Checked = set[tuple[str, float]]
+
 
 class Writer:
     """Sends all writes to the drives on a line."""
@@ -79,17 +82,27 @@ class Writer:
         return self._send(drive, register, raw, call, 0.0, self.records.log)
 
     def insist(
-        self, drive: Drive, step: Write, timeout: float = 0.0, log: Callable[..., None] | None = None
+        self,
+        drive: Drive,
+        step: Write,
+        checked: Checked,
+        timeout: float = 0.0,
+        log: Callable[..., None] | None = None,
     ) -> Outcome:
         """Write a stop, or a raw count that is harmless at any time, without checking rules or the budget.
 
-        Raises WriteForbidden only on proof that the drive is of another family. On a line with late replies,
-        waits up to `timeout` seconds for the write's own reply. `log` records the write; by default, the
-        record is queued until `catch_up`.
+        Raises WriteForbidden only on proof that the drive is of another family. That check is made once in a
+        stop, which keeps its set `checked`: a server that closes the connection after each reply would close
+        it after each check. On a line with late replies, waits up to `timeout` seconds for the write's own
+        reply. `log` records the write; by default, the record is queued until `catch_up`.
         """
         register = step.register
         raw = raw_count(drive, register, step.value)
-        self.identity_check.check_before_stop(drive, register, raw)
+        if (register.name, raw) not in checked:
+            was_lost = self._exchanges.line.is_lost
+            self.identity_check.check_before_stop(drive, register, raw)
+            if not was_lost:
+                checked.add((register.name, raw))
         kept = wears(drive, register)
         try:
             return self._send(drive, register, raw, None, timeout, log or self.records.log_later)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
@@ -187,15 +187,6 @@ class LineSet:
             AuditLog(self._audit).close()
 
     # ---- closing and removing lines ----
-
-    @contextmanager
-    def tended(self) -> Iterator[None]:
-        """In the `with` block, the poller reopens lost ports. After the block, stops reopen them."""
-        try:
-            yield
-        finally:
-            for line in self._lines:
-                line.bus.tended(False)
 
     def end_polling(self) -> None:
         """Stop polling on all lines; commands are still carried out."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from typing import Any
 
 from multidrop.bus import Bus
@@ -46,13 +45,15 @@ class Reopening:
         return self._thread is not None and self._thread.is_alive()
 
     def begin(self) -> None:
-        """Start an attempt to reopen the port. If no thread can be started, let stops reopen it instead."""
+        """Start an attempt to reopen the port. If no thread can be started, stops reopen it themselves."""
         thread = threading.Thread(target=self._attempt, name="multidrop reopening", daemon=True)
         self._thread = None
-        with suppress(RuntimeError, MemoryError):
+        self._bus.note_reopening(True)
+        try:
             thread.start()
             self._thread = thread
-        self._bus.tended(self._thread is not None)
+        except (RuntimeError, MemoryError):
+            self._bus.note_reopening(False)
 
     def join(self) -> None:
         """Wait until the current attempt, if any, is over."""
@@ -69,6 +70,8 @@ class Reopening:
             log_aside(
                 _log, logging.ERROR, "%s: not opened again\n%s", self._bus.line.port, traceback_of(failure)
             )
+        finally:
+            self._bus.note_reopening(False)
 
 
 def line_summary(seconds: float, peers: Mapping[str, Peer]) -> dict[str, Any]:
@@ -108,6 +111,8 @@ REOPEN_NS = 500_000_000  # interval between attempts to reopen a lost port
 # Limit of losses without a reply in between after which the port is reopened at once. It is above one,
 # because some devices close each connection at one particular request.
 MOST_AT_ONCE = 2
+# time after the reopening of a lost port during which the requests of stops go before polls
+STOPS_FIRST_NS = 500_000_000
 # interval at which miss rows are added while this process may not poll the line
 STANDBY_NS = 500_000_000
 RETRY_NS = 500_000_000  # pause before polling is retried after a failure; each further failure doubles it
@@ -157,6 +162,7 @@ class PolledLine:
         self._losses = 0  # number of losses since a drive answered
         self._tried_ns = 0  # when the last attempt to reopen the port was made
         self._reopen_ns = 0  # when the next attempt is due
+        self._opened_ns = 0  # when the present port was first seen open
         self._standby_ns = 0
         self.failure = ""  # the last failure of polling; "" after SOUND_NS without another failure
         self._failures = 0  # number of failures of polling in a row
@@ -322,7 +328,6 @@ class PolledLine:
     def start(self) -> None:
         with self._lock:
             self.started_ns = clock.now_ns()
-            self.bus.tended(True)
             self.bus.reset_statistics()
             # not all drives of the bus, because some may not be polled
             polled = [polled.drive for polled in self.polled]
@@ -403,8 +408,10 @@ class PolledLine:
                 self._queue.give_back()
                 self._queue.move_to(port)
                 port.report_to(self._row_queue, self.number)
+                self._opened_ns = now_ns
             self._queue.conclude(port)
-            if self._lost_ns and any(peer.answered_ns > self._tried_ns for _, peer in self._polled):
+            since_ns = max(self._lost_ns, self._tried_ns)
+            if self._lost_ns and any(peer.answered_ns > since_ns for _, peer in self._polled):
                 self._lost_ns = self._losses = 0
             if port.lost:
                 self._lose(port, now_ns)
@@ -414,12 +421,23 @@ class PolledLine:
                 self._queue.pause(port)
                 self._stand_by(now_ns, Status.NOT_MASTER)
                 return
+            if self._leaves_port_to_stops(now_ns):
+                return
             if now_ns - self._learnt_ns >= LEARN_NS:
                 self._learn(now_ns)
             self._observe(now_ns)
             self._refusals.update(now_ns)
             self._queue.keep_busy(port, now_ns)
             self._miss_unasked(now_ns)
+
+    def _leaves_port_to_stops(self, now_ns: int) -> bool:
+        """Return True just after a lost port was reopened, while stops are repeated.
+
+        Some servers close the connection after each reply. If the first request were a poll, a stop that
+        waits for its reply would never be sent.
+        """
+        is_new = self._lost_ns > 0 and now_ns < self._opened_ns + STOPS_FIRST_NS
+        return is_new and bool(self.bus.stops_under_way())
 
     def _observe(self, now_ns: int) -> None:
         """Report failures and late replies to the schedule, which polls silent drives less often."""
@@ -480,13 +498,11 @@ class PolledLine:
     def _lose(self, port: Port, now_ns: int) -> None:
         port.stop()
         self._queue.give_back()
-        self.bus.line.drop()
+        self.bus.line.drop_lost()
         self._lost_ns = self._lost_ns or now_ns
         self._losses += 1
         if self._losses <= MOST_AT_ONCE:
             self._reopen_ns = now_ns
-        else:
-            self.bus.tended(False)  # stops reopen the port themselves until the next attempt
 
     def _regain(self, now_ns: int) -> None:
         """Reopen the port in a thread; until that succeeds, add a miss row for each value that is due.
@@ -501,10 +517,9 @@ class PolledLine:
         self._reopening.begin()
 
     def leave(self) -> None:
-        """Stop tending the line. From now on, stops reopen a lost port themselves."""
+        """Stop tending the line. From now on, only stops reopen a lost port."""
         with self._lock:
             self._is_left = True
-        self.bus.tended(False)
 
     def end(self) -> bool:
         """Stop polling and reopening; return True while an exchange is still in flight."""

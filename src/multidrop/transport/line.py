@@ -250,6 +250,12 @@ class Line:
             core.stop()
             self._opened.must_discard |= bool(core.called_off)
 
+    def drop_lost(self) -> None:
+        """Drop the port as `drop` does if it is lost; another thread may have reopened it meanwhile."""
+        with self._lock:
+            if self.queue is not None and self.queue.lost:
+                self.drop()
+
     @undisturbed
     def close(self) -> None:
         """Close the port for good: `regain` then raises LineError."""

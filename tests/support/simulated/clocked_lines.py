@@ -265,11 +265,11 @@ class ClockedLine:
     def overruns(self) -> None:
         pass
 
-    def drop(self) -> None:
+    def drop_lost(self) -> None:
         if self.queue:
             self.queue = self._clocked.ports[self.port] = None
 
-    close = drop
+    close = drop_lost
 
     def reopen(self) -> None:
         self.close()
