@@ -16,6 +16,7 @@ import pytest
 from commands import TOY, Run
 from kills import BoundProcess
 from lines import Faulty, patient
+from simulated_bus import SimulatedBus
 from tables import table
 from toy import Status, Toy
 
@@ -23,10 +24,11 @@ import multidrop.cli
 from multidrop.cli.support.output import confirm
 from multidrop.cli.support.values import nearest_value
 from multidrop.control import eeprom_ledger as ledger
+from multidrop.core import Message
 from multidrop.errors import WriteForbidden
 from multidrop.families.innovert_ibd import InnovertIBD
 from multidrop.families.invt_che import InvtCHE
-from multidrop.sim import simulated
+from multidrop.sim import MotorDrive, simulated
 from multidrop.sim.drive import SimulatedDrive
 from multidrop.sim.simulator import Simulator
 from multidrop.sim.wire import Wire
@@ -253,6 +255,33 @@ def test_starting_a_drive_with_unreadable_setpoint_needs_a_frequency(run: Run) -
 def test_start_writes_the_setpoint_first(run: Run, port: str, toy: SimulatedDrive) -> None:
     assert run("start", port, TOY, 1, "--frequency", 20, "--yes")[0] == 0
     assert [write.name for write in toy.counters.writes] == ["frequency", "control"]
+
+
+@pytest.mark.parametrize("at", ["opening", "setpoint", "reading"])
+def test_a_start_is_not_sent_if_the_process_was_suspended_before_it(
+    run: Run, monkeypatch: pytest.MonkeyPatch, at: str
+) -> None:
+    """The user may press Ctrl-Z during the command, and continue it hours later."""
+    sim = simulated(InvtCHE(1, maximum_frequency=50))
+    assert isinstance(sim, MotorDrive)
+    line = SimulatedBus(sim)
+    places = {"setpoint": lambda each: each.start == 0x2000, "reading": lambda each: each.start == 0x3016}
+
+    def answer(request: Message) -> None:
+        if at in places and places[at](request):
+            line.slept = 3600.0
+
+    def open_late() -> SimulatedBus:
+        line.slept = 3600.0 if at == "opening" else 0.0
+        return line
+
+    monkeypatch.setattr(line, "answers", answer)
+    monkeypatch.setattr(line, "open", open_late)
+    words = ("start", "hall", "invt-che", 1, "--yes", "--frequency", 20, "--option", "maximum_frequency=50")
+    status, _, err = run(*words)
+    assert (status, "was not sent" in err) == (1, True)
+    assert not sim.motor.energised
+    assert line.slept
 
 
 @patient

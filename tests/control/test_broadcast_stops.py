@@ -104,11 +104,9 @@ def test_stop_all_reports_failed_if_neither_broadcast_nor_stop_was_sent(models: 
 
 
 @pytest.mark.parametrize("seconds", [0, 0.05])
-def test_a_stop_with_a_short_time_limit_is_sent_to_each_drive_after_the_broadcast(
-    monkeypatch: pytest.MonkeyPatch, seconds: float
-) -> None:
+def test_a_stop_with_a_short_time_limit_is_sent_to_each_drive_after_the_broadcast(seconds: float) -> None:
     """Noise may damage the broadcast, which no drive answers."""
-    line, _, sims = che_drives(monkeypatch, 5, runs_s=20)
+    line, _, sims = che_drives(5, runs_s=20)
     line.deafens = lambda request: request.address == 0
     line.bus.stop_all(seconds)
     assert len(broadcasts(line)) == 1

@@ -317,6 +317,34 @@ def test_no_step_is_carried_out_after_the_computer_has_slept(
         assert turning(sims) == []
 
 
+SETPOINT_AND_START = """
+[[phase]]
+name = "start"
+[[phase.step]]
+frequency = { fan = 10.0 }
+start = ["fan"]
+dwell = "2 s"
+"""
+
+
+def test_no_start_is_sent_after_a_suspension_between_two_commands_of_a_step(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The process is suspended while the setpoint is written; the run does not notice it before the start."""
+    monkeypatch.setattr(runner, "LOOK_S", 0.5)
+    with simulated_test(write_test(tmp_path, SETPOINT_AND_START), speed=SPEED) as (plan, (fan,)):
+        awake, written = clock.boottime_ns, fan.counters.writes
+
+        def boottime_ns() -> int:
+            return awake() + (3_600_000_000_000 if any(write.name == "setpoint" for write in written) else 0)
+
+        monkeypatch.setattr(clock, "boottime_ns", boottime_ns)
+        result = TestRun(plan, speed=SPEED).run()
+        assert result.abort
+        assert {write.name for write in written if write.raw != 5} == {"setpoint"}
+        assert turning([fan]) == []
+
+
 @pytest.mark.slow
 def test_a_run_is_not_ok_if_stopping_a_line_raises(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     original = Bus.stop_all

@@ -37,6 +37,7 @@ from multidrop.cli.support.output import (
     warn,
 )
 from multidrop.cli.support.values import as_json, nearest_value
+from multidrop.control.call import written_before
 from multidrop.control.outcome import Seen, Stopped
 from multidrop.control.records import AuditLog
 from multidrop.control.stops import LEAST_S
@@ -45,7 +46,9 @@ from multidrop.drive.state import Direction, State
 from multidrop.drive.verbs import Script, Write
 from multidrop.errors import LineError, Unsupported
 from multidrop.plant.model import Plant, PlantLine
+from multidrop.transport import clock
 
+SENDING_S = 30.0  # s; longest time from the user's confirmation to the first write, port opening included
 _DIRECTED = ("start", "jog")
 _FURTHER = {"set-frequency": ("HZ",)}  # words that follow the drive's name, by command
 _SHOWING_WATCHDOG = ("state", *_DIRECTED)  # commands that print how the motor reacts if this program dies
@@ -110,11 +113,17 @@ def run(arguments: argparse.Namespace) -> int:
         how = _details(arguments)
         confirm(f"{_QUESTIONS[arguments.command]} {drive.name} on {target.port}{how}?", arguments)
     limit = {"seconds": arguments.seconds} if arguments.command in STOPS else {}
-    with _annotating(arguments.command, target) as known, _opened(target, arguments) as bus:
+    until_ns = clock.now_ns() + round(SENDING_S * 1e9)
+    with (
+        written_before(lambda: until_ns),
+        _annotating(arguments.command, target) as known,
+        _opened(target, arguments) as bus,
+    ):
         known.clear()
         if hz is not None and arguments.command != "set-frequency":
-            drive.set_frequency(hz)
-        state = verb(*parameters, **limit)
+            state = _start_at(drive, hz, *parameters)
+        else:
+            state = verb(*parameters, **limit)
         known.append(f"{drive.name}: {arguments.command} is done")
         watchdog = bus.watchdog(drive) if arguments.command in _SHOWING_WATCHDOG else ""
         if not isinstance(state, State):
@@ -129,6 +138,16 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         print_text(_sentence(arguments.command, drive, state, setpoint, watchdog))
     return MISTAKE if words and arguments.command in STOPS else DONE
+
+
+def _start_at(drive: Drive, hz: float, direction: Direction | None) -> object:
+    """Write the setpoint and start the motor in one call, so that the start expires if the process sleeps."""
+
+    def script() -> Script[None]:
+        yield from drive.set_frequency.script(hz)
+        yield from drive.start.script(direction)
+
+    return drive.carry_out_move(script(), drive.begin_call("start", drive.stops_called[0]))
 
 
 def _target(arguments: argparse.Namespace) -> tuple[Target, list[str]]:

@@ -17,6 +17,7 @@ from threading import Thread
 from typing import Any, ClassVar
 
 from multidrop.bus import Bus
+from multidrop.control.call import written_before
 from multidrop.control.eeprom_ledger import Ledger
 from multidrop.control.exit_hook import await_signal
 from multidrop.control.outcome import Seen, Stopped
@@ -351,10 +352,16 @@ class _Session:
 
     def _check_standstill(self) -> None:
         """Raise _Aborted if no rows were compared for too long, such as while the process was suspended."""
-        before_ns, self._looked_ns = self._looked_ns, clock.boottime_ns()
-        still_s = (self._looked_ns - before_ns) / 1e9
+        now_ns = clock.boottime_ns()
+        still_s = (now_ns - self._looked_ns) / 1e9
         if still_s > STILL_S:
             raise _Aborted(f"the run stood still for {still_s:.1f} s")
+        self._looked_ns = now_ns
+
+    def _limit_ns(self) -> float:
+        """Return the time in ns (CLOCK_MONOTONIC) from which on the run counts as standing still."""
+        left_ns: float = self._looked_ns + STILL_S * 1e9 - clock.boottime_ns()
+        return clock.now_ns() + left_ns
 
     def take(self) -> bool:
         """Pass one batch of new rows on; return False if there is none.
@@ -390,8 +397,12 @@ class _Session:
         self._insist(drive, check, NoReply, BadReply, Expired)
 
     def _command(self, drive: Drive, step: RunStep) -> None:
-        """Carry out a step's commands to this drive. A start that may have been sent is not repeated."""
-        self._insist(drive, lambda: _command(drive, step), Expired)
+        """Carry out a step's commands to this drive. A start that may have been sent is not repeated.
+
+        Nothing is sent after a suspension of the process, even if `_check_standstill` has not noticed it yet.
+        """
+        with written_before(self._limit_ns):
+            self._insist(drive, lambda: _command(drive, step), Expired)
 
     def _insist(self, drive: Drive, work: Callable[[], object], *too_late: type[Exception]) -> object:
         """Do the work. If the drive is simulated, repeat the work after one of the errors `too_late`."""
