@@ -271,6 +271,16 @@ def test_a_plot_draws_no_line_over_a_time_without_values(opened: Opener) -> None
     assert seen == [[False], [True, False], [False]]
 
 
+def test_a_plot_of_the_newest_samples_has_counters_of_32_bits_exactly(opened: Opener) -> None:
+    numbers = [2**32 - 1 - at for at in range(100)]
+    added = """numbers => import('/page/data/ring.js').then(({ Ring }) => {
+        const ring = new Ring(200);
+        for (const [ms, number] of numbers.entries()) ring.add(ms, number);
+        return ring.since(-Infinity)[1];
+    })"""
+    assert opened(live=False).evaluate(added, numbers) == numbers
+
+
 TAKEN_ANEW = """change => import('/page/data/store.js').then(({ store, takePlant }) => {
   window.original ??= store.plant;
   const plant = structuredClone(window.original);

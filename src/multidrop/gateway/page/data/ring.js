@@ -8,7 +8,7 @@ export class Ring {
     this.count = 0;
     this.at = 0;
     this.times = new Float64Array(Math.min(FIRST, most));
-    this.values = new Float32Array(this.times.length);
+    this.values = new Float64Array(this.times.length);
   }
 
   // Add a sample, unless it is already the newest one.
@@ -25,7 +25,7 @@ export class Ring {
     const [times, values] = this.since(-Infinity);
     const size = Math.min(this.most, this.count * 2);
     this.times = new Float64Array(size);
-    this.values = new Float32Array(size);
+    this.values = new Float64Array(size);
     this.times.set(times);
     this.values.set(values.map(v => v ?? NaN));
     this.at = this.count % size;

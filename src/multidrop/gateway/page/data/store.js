@@ -4,7 +4,7 @@
 import { t } from "../texts.js";
 import { Ring } from "./ring.js";
 
-const SAMPLES = 2e6; // limit of samples kept, of all registers together
+const SAMPLES = 1.5e6; // limit of samples kept, of all registers together
 const UNPOLLED_S = 5; // how long a value of an unpolled register stays current
 const FAILED_LIMIT_MS = 1000; // age (ms) from which a value is old if the newest request failed
 const LOOK_MS = 60000; // time in which the gateway reads all registers of a viewed drive
