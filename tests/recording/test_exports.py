@@ -134,6 +134,21 @@ def test_hdf5_has_the_rows_of_the_recording(tmp_path: Path) -> None:
         assert json.loads(file["metadata"][()]) == METADATA
 
 
+def test_exports_have_the_names_of_negative_values(tmp_path: Path) -> None:
+    import h5py
+    from asammdf import MDF
+
+    names = {"REVERSE": -1, "REST": 0, "FORWARD": 1}
+    about = {"drives": {"pump": {"registers": {"direction": {"unit": "", "values": names}}}}}
+    source = record(tmp_path / "a.arrows", [row(at, "pump", "direction", at - 1.0) for at in range(3)], about)
+    for suffix in (".mf4", ".h5"):
+        convert(source, tmp_path / f"a{suffix}")
+    with MDF(tmp_path / "a.mf4") as mdf:
+        assert mdf.get("pump.direction").samples.tolist() == [name.encode() for name in names]
+    with h5py.File(tmp_path / "a.h5") as file:
+        assert json.loads(file["drives/pump/direction"].attrs["values"]) == names
+
+
 def test_error_for_an_unknown_suffix_lists_the_suffixes_of_exports(tmp_path: Path) -> None:
     source = record(tmp_path / "run.arrows", rows(1), METADATA)
     with pytest.raises(ValueError, match=r"must end in \.arrows, \.csv, \.parquet, \.mf4, \.h5"):

@@ -98,6 +98,12 @@ def test_a_fault_number_without_a_name_is_not_shown_as_a_sum_of_faults(tmp_path:
     ]
 
 
+def test_a_negative_value_is_shown_by_its_name(tmp_path: Path) -> None:
+    about = {"drives": {"pump": {"registers": {"fault": {"unit": "", "values": {"REVERSE": -1}}}}}}
+    (series,) = load(record(tmp_path / "it.arrows", [row(0, "pump", "fault", -1)], about)).series
+    assert (series.name_of(-1.0), series.name_of(-2.0)) == ("REVERSE", "code -2")
+
+
 @pytest.mark.parametrize(
     ("limit", "value", "mistake"),
     [

@@ -95,7 +95,7 @@ def _checked(register: dict[str, Any]) -> dict[str, Any]:
 
 
 def _is_count(count: object) -> bool:
-    return is_whole(count) and 0 <= count < LARGEST_COUNT
+    return is_whole(count) and abs(count) < LARGEST_COUNT
 
 
 def unit_of_register(about: Mapping[str, Any]) -> str:

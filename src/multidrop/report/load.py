@@ -128,12 +128,12 @@ class Series:
 
     def name_of(self, value: float) -> str:
         """Return the name of a raw value, or the names of its set bits; "code 7" if it has no name."""
-        if not value.is_integer() or not 0 <= value < LARGEST_COUNT:
+        if not value.is_integer() or not abs(value) < LARGEST_COUNT:
             return f"code {value:g}"
         number = int(value)
         if number in self.names:
             return self.names[number]
-        if not self.is_bits:
+        if not self.is_bits or number < 0:
             return f"code {number}"
         return " ".join(
             self.names.get(1 << bit, f"bit {bit}") for bit in range(number.bit_length()) if number >> bit & 1
