@@ -314,6 +314,19 @@ def test_opc_ua_clients_have_the_rights_of_their_tokens(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_an_opc_ua_client_with_a_wrong_token_can_only_stop_drives_if_anyone_may(gateway: Served) -> None:
+    client = Client(url_of(gateway), timeout=PATIENCE)
+    client.set_user("anna")
+    client.set_password("revoked")
+    with client:
+        gateway.start("pump-1")
+        assert "stop" in stop(client, "pump-1")
+        until(lambda: gateway.stands("pump-1"))
+        with pytest.raises(ua.UaStatusCodeError, match="BadUserAccessDenied"):
+            read(client, "pump-1.State")
+
+
+@pytest.mark.slow
 def test_a_reload_removes_and_adds_opc_ua_objects_of_drives(tmp_path: Path) -> None:
     class Notes:
         codes: list[str] = []

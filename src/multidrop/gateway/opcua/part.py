@@ -228,7 +228,7 @@ class OpcUa:
         from multidrop.gateway.opcua.nodes import PlantNodes, lasting
         from multidrop.gateway.opcua.server import PlantServer
 
-        server = PlantServer(self._listener, lambda visitor: self._caller(visitor) is not None, self._call)
+        server = PlantServer(self._listener, lambda *given: self._caller(*given) is not None, self._call)
         with self._quick_process():
             with lasting():
                 await server.open(self._context.version, self._identity)
@@ -259,16 +259,22 @@ class OpcUa:
                 sys.setswitchinterval(USUAL_SWITCH_S)
                 gc.unfreeze()
 
-    def _caller(self, visitor: Visitor) -> Caller | None:
-        """Return a session's user with their present rights; None if the user may not read values."""
+    def _caller(self, visitor: Visitor, needed: Right) -> Caller | None:
+        """Return a session's user with their present rights; None if the user lacks the right `needed`.
+
+        A user with a wrong token has no rights, except to stop if anyone may stop.
+        """
         tokens, may, address = self._context.tokens, self._context.commands.may, visitor.address
         token = None
         if visitor.secret and tokens:  # a gateway without tokens ignores the token that a user sends
             token = tokens.find(visitor.secret)
             if token is None:
                 self._note_wrong(visitor)
-                return None
-        return caller_with(token, may.without_token(is_loopback=is_loopback(address)), "opcua", address)
+                if needed is not Right.STOP:
+                    return None
+        free = may.without_token(is_loopback=is_loopback(address))
+        caller = caller_with(token, free, "opcua", address)
+        return caller if caller is not None and caller.role >= needed else None
 
     def _note_wrong(self, visitor: Visitor) -> None:
         now, address = time.monotonic(), visitor.address
@@ -291,8 +297,8 @@ class OpcUa:
         stops = self._opened[2].stops
         if call.MethodId not in stops:
             return ua.CallMethodResult(ua.StatusCode(ua.StatusCodes.BadMethodInvalid))
-        drive, caller = stops[call.MethodId], self._caller(visitor)
-        if caller is None or caller.role < Right.STOP:
+        drive, caller = stops[call.MethodId], self._caller(visitor, Right.STOP)
+        if caller is None:
             return ua.CallMethodResult(ua.StatusCode(ua.StatusCodes.BadUserAccessDenied))
         stopping = None
         if self._stopping[drive] < MOST_STOPS:

@@ -31,6 +31,8 @@ from cryptography.exceptions import UnsupportedAlgorithm
 from cryptography.hazmat.primitives.asymmetric.rsa import RSAPrivateKey
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
+from multidrop.gateway.http.rights import Right
+
 PRODUCT, NAMESPACE = "urn:multidrop", "urn:multidrop:plant"
 CHUNK = 65_535  # limit of a chunk of a message, in bytes
 MOST_REQUEST = 1 << 18  # limit of a request in bytes
@@ -51,8 +53,16 @@ POLICIES = (
     ua.SecurityPolicyType.Aes128Sha256RsaOaep_SignAndEncrypt,
     ua.SecurityPolicyType.Aes256Sha256RsaPss_SignAndEncrypt,
 )
+
+
+def _service(name: str) -> ua.NodeId:
+    """Return the id of a service's requests."""
+    return ua.NodeId(getattr(ua.ObjectIds, f"{name}Request_Encoding_DefaultBinary"))
+
+
+CALL = _service("Call")
 SERVICES = frozenset(
-    ua.NodeId(getattr(ua.ObjectIds, f"{name}Request_Encoding_DefaultBinary"))
+    _service(name)
     for name in (
         *("Read", "Browse", "BrowseNext", "TranslateBrowsePathsToNodeIds"),
         *("RegisterNodes", "UnregisterNodes"),
@@ -80,7 +90,7 @@ class Visitor(User):
     secret: str = field(default="", repr=False)
 
 
-MayRead = Callable[[Visitor], bool]  # a function that returns whether the user may read values
+HasRight = Callable[[Visitor, Right], bool]  # a function that returns whether the user has a right
 # a function that calls a method, which is always a stop
 Stop = Callable[[ua.CallMethodRequest, Visitor], Awaitable[ua.CallMethodResult]]
 
@@ -88,10 +98,10 @@ Stop = Callable[[ua.CallMethodRequest, Visitor], Awaitable[ua.CallMethodResult]]
 class _Admission(UserManager, SimpleRoleRuleset):
     """Admits users at login, and again at each request, because a reload may have revoked their token."""
 
-    def __init__(self, admit: MayRead) -> None:
+    def __init__(self, may: HasRight) -> None:
         super().__init__()
         self.address = ""  # address of the client that is logging in
-        self._admit = admit
+        self._may = may
 
     def get_user(
         self,
@@ -101,10 +111,11 @@ class _Admission(UserManager, SimpleRoleRuleset):
         certificate: Any = None,
     ) -> Visitor | None:
         visitor = Visitor(name=username, address=self.address, secret=str(password or ""))
-        return visitor if self._admit(visitor) else None
+        return visitor if self._may(visitor, Right.LOOK) or self._may(visitor, Right.STOP) else None
 
     def check_validity(self, user: Visitor, action_type_id: ua.NodeId, body: Any) -> bool:
-        return action_type_id in SERVICES and self._admit(user)
+        may_stop = action_type_id == CALL and self._may(user, Right.STOP)
+        return may_stop or (action_type_id in SERVICES and self._may(user, Right.LOOK))
 
 
 class _Items(MonitoredItemService):
@@ -206,8 +217,8 @@ def _check_count(operations: Any) -> None:
 class _Internal(InternalServer):
     """asyncua's server without its network connections, with limits."""
 
-    def __init__(self, admit: MayRead, stop: Stop) -> None:
-        self.admission = _Admission(admit)
+    def __init__(self, may: HasRight, stop: Stop) -> None:
+        self.admission = _Admission(may)
         super().__init__(user_manager=self.admission)
         self.stop_method = stop
         self.supported_tokens = (ua.AnonymousIdentityToken, ua.UserNameIdentityToken)
@@ -310,11 +321,11 @@ def read_identity(certificate: Path, key: Path) -> Identity:
 class PlantServer(Server):
     """The OPC UA server.
 
-    `admit` returns whether a user may read, and `stop` calls a method, which is a stop.
+    `may` returns whether a user has a right, and `stop` calls a method, which is a stop.
     """
 
-    def __init__(self, listener: socket.socket, admit: MayRead, stop: Stop) -> None:
-        self.internal = _Internal(admit, stop)
+    def __init__(self, listener: socket.socket, may: HasRight, stop: Stop) -> None:
+        self.internal = _Internal(may, stop)
         super().__init__(iserver=self.internal)
         self._listener = listener
         self.limits = TransportLimits(CHUNK, CHUNK, MOST_REQUEST // CHUNK + 1, MOST_REQUEST)
