@@ -125,7 +125,6 @@ class Quiet(Toy):
 
     @verb
     def state(self) -> Script[State]:
-        """Report the state as unknown."""
         yield from ()
         return State(Condition.STOPPED)
 

@@ -47,7 +47,6 @@ class Rig(Drive):
 
     @verb
     def identify(self) -> Script[None]:
-        """Accept any drive."""
         yield from ()
 
 

@@ -283,7 +283,6 @@ class Mute(Drive):
 
     @verb
     def stop(self) -> Script[None]:
-        """Stop the motor."""
         yield from write(self.run, 0)
 
 

@@ -98,7 +98,6 @@ class Restless(Own):
 
     @verb
     def stop(self) -> Script[None]:
-        """Stop the motor."""
         yield from insist(self.run, 0)
         while (yield from read(self.ratio)) >= 0:
             pass
@@ -112,7 +111,6 @@ class Careful(Own):
 
     @verb
     def stop(self) -> Script[None]:
-        """Stop the motor."""
         ratio = yield from read(self.ratio)
         yield from write(self.run, 7 if ratio else 0)
         yield from wait(2)

@@ -59,7 +59,6 @@ class Watched(Brief):
 
     @verb
     def stop(self) -> Script[None]:
-        """Stop the motor."""
         yield from insist(Toy.control, Status(0))
         yield from read(Toy.status)
 
@@ -124,7 +123,7 @@ CALLS: dict[str, Callable[[Scene], object]] = {
 
 
 @pytest.mark.parametrize("call", CALLS.values(), ids=CALLS)
-def test_before_the_mastership_no_call_sends_anything(scene: Scene, call: Callable[[Scene], object]) -> None:
+def test_no_call_sends_before_the_process_is_master(scene: Scene, call: Callable[[Scene], object]) -> None:
     begun = time.monotonic()
     with pytest.raises(NotMaster) as failure:
         call(scene)
@@ -139,7 +138,7 @@ def test_before_the_mastership_no_call_sends_anything(scene: Scene, call: Callab
 
 @pytest.mark.slow
 @pytest.mark.parametrize("call", usually("start", *(call for call in CALLS if call != "start")))
-def test_after_the_mastership_no_call_sends_anything(scene: Scene, call: str) -> None:
+def test_no_call_sends_once_the_process_is_no_longer_master(scene: Scene, call: str) -> None:
     scene.become_master()
     scene.drive.read(Toy.output_current)
     before = scene.requests
@@ -149,7 +148,7 @@ def test_after_the_mastership_no_call_sends_anything(scene: Scene, call: str) ->
     assert scene.requests == before
 
 
-def test_a_lost_mastership_is_not_a_failure_of_the_drive(scene: Scene) -> None:
+def test_a_request_that_only_the_master_may_send_is_no_failure_of_the_drive(scene: Scene) -> None:
     for _ in range(3):
         with pytest.raises(NotMaster):
             scene.drive.read(Toy.output_current)
@@ -158,7 +157,7 @@ def test_a_lost_mastership_is_not_a_failure_of_the_drive(scene: Scene) -> None:
 
 
 @pytest.mark.long
-def test_a_mastership_whose_deadline_has_passed_sends_nothing(scene: Scene) -> None:
+def test_nothing_is_sent_once_the_right_to_send_has_expired(scene: Scene) -> None:
     """The mastership ends by the clock alone, without a call of `end`."""
     mastership = Mastership(guard_s=8)
     path = scene.simulator.wires[0].path
@@ -209,7 +208,7 @@ def test_stop_all_reports_each_unsent_stop(scene: Scene) -> None:
 
 
 @pytest.mark.slow
-def test_a_failed_read_after_a_start_raises_the_lost_mastership(scene: Scene) -> None:
+def test_a_read_after_a_start_raises_if_the_process_is_no_longer_master(scene: Scene) -> None:
     scene.become_master()
     scene.drive.start()
     scene.mastership.end()
@@ -218,7 +217,7 @@ def test_a_failed_read_after_a_start_raises_the_lost_mastership(scene: Scene) ->
 
 
 @pytest.mark.slow
-def test_commands_can_be_sent_after_the_mastership_returns(scene: Scene) -> None:
+def test_commands_can_be_sent_once_the_process_is_master_again(scene: Scene) -> None:
     scene.become_master()
     scene.drive.start()
     scene.mastership.end()
@@ -252,7 +251,7 @@ def test_a_partly_sent_write_is_unconfirmed(scene: Scene, monkeypatch: pytest.Mo
 
 
 @pytest.mark.slow
-def test_losing_mastership_at_the_second_write_raises(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_script_whose_second_write_is_unsent_raises(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """The first write is done and recorded; the second write was not sent."""
     scene.become_master()
     hold_back(monkeypatch, scene, sent_ns=0, after=1)
@@ -266,7 +265,7 @@ def test_losing_mastership_at_the_second_write_raises(scene: Scene, monkeypatch:
     assert len([*read_audit(scene.audit)]) == 1
 
 
-def test_a_sent_stop_is_unconfirmed_if_mastership_ends(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sent_stop_of_a_former_master_is_unconfirmed(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """The stop was sent, so it is not reported as unsent."""
     scene.become_master()
     carry_out = scene.bus.line.carry_out
@@ -402,7 +401,7 @@ def test_a_stop_is_sent_although_another_master_is_heard(shared: tuple[int, Bus,
 
 @pytest.mark.slow
 @pytest.mark.parametrize("port", ["tcp://127.0.0.1:0", "socket://127.0.0.1:0"])
-def test_network_ports_send_nothing_without_mastership(port: str) -> None:
+def test_network_ports_send_nothing_unless_the_process_is_master(port: str) -> None:
     mastership, sim = Mastership(), simulated(Brief(1))
     mastership.extend(now_ns() + 1000 * S)
     simulator = Simulator([Wire([sim], unpaced=True, port=port)])

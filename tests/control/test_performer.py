@@ -64,7 +64,6 @@ class Stubborn(Drive):
 
     @verb
     def stop(self) -> Script[None]:
-        """Stop the motor."""
         yield from write(self.run, 0)
 
 

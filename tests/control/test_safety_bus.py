@@ -242,7 +242,6 @@ class Tidy(Drive):
 
     @verb
     def start(self, direction: Direction | None = None) -> Script[None]:
-        """Start the motor."""
         with suppress(Expired, NotMaster):
             yield from write(self.run, 1)
         yield from read(self.speed)

@@ -240,7 +240,6 @@ class Patient(Own):
 
     @verb
     def stop(self) -> Script[None]:
-        """Stop the motor."""
         yield from write(self.run, 0)
         yield from wait(20)
         yield from read(self.speed)
@@ -456,7 +455,6 @@ def test_stop_all_stops_other_drives_if_a_script_raises() -> None:
 
         @verb
         def stop(self) -> Script[None]:
-            """Stop the motor."""
             raise KeyError("speed")
             yield
 
@@ -465,7 +463,6 @@ def test_stop_all_stops_other_drives_if_a_script_raises() -> None:
 
         @verb
         def stop(self) -> Script[None]:
-            """Stop the motor."""
             yield from write(self.run, 0)
             raise ZeroDivisionError("division by zero")
 

@@ -183,7 +183,6 @@ class Looking(Own):
 
     @verb
     def start(self, direction: Direction | None = None) -> Script[None]:
-        """Start the motor."""
         for _ in range(20):
             yield from read(self.speed)
         yield from write(self.ratio, 1)
@@ -217,7 +216,6 @@ def test_a_start_does_not_expire_because_of_slow_reads() -> None:
 
         @verb
         def start(self, direction: Direction | None = None) -> Script[None]:
-            """Start the motor."""
             for _ in range(20):
                 yield from wait(1.0)
                 yield from read(self.speed)

@@ -40,7 +40,6 @@ class Pump(Fan):
 
     @verb
     def start(self, direction: Direction | None = None) -> Script[None]:
-        """Start the motor."""
         yield from write(self.control, Word.RUN)
 
     @verb
@@ -55,7 +54,6 @@ class Pump(Fan):
 
     @verb
     def set_frequency(self, hz: float) -> Script[None]:
-        """Write the setpoint."""
         yield from write(self.target, hz)
 
     @verb

@@ -17,7 +17,7 @@ from examples import examples
 from kills import descriptors, threads
 from lines import PATIENCE, line, plant, polled, until
 from serial.urlhandler import protocol_socket
-from toy import Toy
+from toy import QuickToy, Toy
 
 from multidrop.bus import Bus
 from multidrop.control.outcome import Seen, Stopped
@@ -30,18 +30,12 @@ from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
 CURRENT, STATUS = Toy.registers["output_current"], Toy.registers["status"]
 
 
-class Quick(Toy):
-    """A drive with a short timeout."""
-
-    response_timeout = 0.05
-
-
 class TwoLines:
     """Two lines with two simulated drives each."""
 
     def __init__(self, port: str = "pty") -> None:
         self.pumps, self.fans = (
-            {address: simulated(Quick(address)) for address in (1, 2)} for _ in ("hall", "yard")
+            {address: simulated(QuickToy(address)) for address in (1, 2)} for _ in ("hall", "yard")
         )
         self.simulator = Simulator(
             [Wire([*drives.values()], unpaced=True, port=port) for drives in (self.pumps, self.fans)]
@@ -68,7 +62,7 @@ class TwoLines:
 
 
 def quick(name: str, address: int, every: float | None = 0.02) -> PolledDrive:
-    return polled(Quick(address, name=name), [CURRENT, STATUS], every)
+    return polled(QuickToy(address, name=name), [CURRENT, STATUS], every)
 
 
 @pytest.fixture
@@ -189,7 +183,7 @@ def test_drives_on_an_opening_line_stop_at_exit(both: TwoLines, monkeypatch: pyt
         assert {name: bus.stops_on_exit for name, bus in poller.buses.items()} == {"hall": True, "yard": True}
 
 
-class Other(Quick):
+class Other(QuickToy):
     """A drive of another family, which may interpret the first family's stop as a different command."""
 
     model = "other"
@@ -282,7 +276,7 @@ def test_a_drive_can_be_removed_during_another_stop(both: TwoLines, monkeypatch:
 
 def test_replaced_drives_stay_attached_during_stops(both: TwoLines, monkeypatch: pytest.MonkeyPatch) -> None:
     """The new drives have the names of the old ones, which can still be stopped."""
-    replacements = [polled(Quick(address, name=f"pump-{address}", silence=0.01), []) for address in (1, 2)]
+    replacements = [polled(QuickToy(address, name=f"pump-{address}", silence=0.01), []) for address in (1, 2)]
     with Poller(plant(both.hall())) as poller:
         bus = poller.bus("hall")
         pump_1, pump_2 = bus.drives
@@ -458,7 +452,7 @@ def test_adopt_opens_other_ports_beside_a_slow_one(both: TwoLines, monkeypatch: 
 
 
 def test_a_drive_can_be_stopped_while_a_port_opens(both: TwoLines, monkeypatch: pytest.MonkeyPatch) -> None:
-    replacement = polled(Quick(1, name="pump-1", silence=0.01), [])
+    replacement = polled(QuickToy(1, name="pump-1", silence=0.01), [])
     with Poller(plant(both.hall())) as poller, Blocked() as opening:
         poller.bus("hall").drives[0].start()
         monkeypatch.setattr(Bus, "__init__", opening.blocking(Bus.__init__))

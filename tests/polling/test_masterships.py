@@ -20,7 +20,7 @@ from examples import usually
 from lines import HOST_LATE, PATIENCE, line, plant, polled, rows_of, until
 from serial.urlhandler import protocol_socket
 from tables import table
-from toy import Toy
+from toy import QuickToy, Toy
 
 from multidrop import Bus, NotMaster
 from multidrop.core import Mastership, RowQueue
@@ -44,12 +44,6 @@ NOT_MASTER, OTHER_MASTER = "not sent: not master", "not sent: another master"
 paces = pytest.mark.parametrize("every", usually(0.02, None), ids=["on a grid", "as fast as it goes"])
 
 
-class Quick(Toy):
-    """A drive with a short timeout."""
-
-    response_timeout = 0.05
-
-
 class Slow(Toy):
     """A drive with a timeout longer than any delay of the other master, even on a busy computer."""
 
@@ -61,7 +55,7 @@ def now_ns() -> int:
 
 
 def quick(name: str, address: int, every: float | None) -> PolledDrive:
-    return polled(Quick(address, name=name), [CURRENT, STATUS], every)
+    return polled(QuickToy(address, name=name), [CURRENT, STATUS], every)
 
 
 @pytest.fixture
@@ -78,7 +72,7 @@ def hold(mastership: Mastership) -> None:
 @contextmanager
 def lines(every: float | None, port: str = "pty") -> Iterator[tuple[list[SimulatedDrive], list[PlantLine]]]:
     """Yield two simulated drives, each on its own line, and the declarations of the lines."""
-    drives = [simulated(Quick(1)) for _ in range(2)]
+    drives = [simulated(QuickToy(1)) for _ in range(2)]
     with Simulator([Wire([drive], unpaced=True, port=port) for drive in drives]) as simulator:
         paths = [wire.path for wire in simulator.wires]
         names = ("hall", "pump"), ("yard", "fan")
@@ -115,7 +109,7 @@ class Rows:
 
 @pytest.mark.slow
 @paces
-def test_a_plant_is_polled_while_its_mastership_holds(mastership: Mastership, every: float | None) -> None:
+def test_a_plant_is_polled_only_by_the_lines_master(mastership: Mastership, every: float | None) -> None:
     with lines(every) as (sims, made), Poller(plant(*made), mastership=mastership) as poller:
         rows = Rows(poller)
         rows.until("pump", NOT_MASTER)
@@ -140,7 +134,7 @@ def test_a_plant_is_polled_while_its_mastership_holds(mastership: Mastership, ev
 
 @pytest.mark.slow
 @paces
-def test_a_line_without_mastership_has_few_rows(mastership: Mastership, every: float | None) -> None:
+def test_a_process_that_is_not_master_gets_few_rows(mastership: Mastership, every: float | None) -> None:
     """The poller must not run a busy loop while it is not the master."""
     with lines(every) as (_, made), Poller(plant(*made), mastership=mastership) as poller:
         Rows(poller).until("pump", NOT_MASTER)
@@ -290,7 +284,7 @@ def test_the_port_of_a_removed_line_is_closed_and_gets_no_byte(mastership: Maste
 
 
 @pytest.mark.slow
-def test_no_port_is_opened_without_mastership(mastership: Mastership, far: Listener) -> None:
+def test_no_port_is_opened_before_the_process_is_master(mastership: Mastership, far: Listener) -> None:
     """The port is neither opened nor reopened, because this could end the present master's connection."""
     yard = line(far.url, quick("fan", 1, None), name="yard")
     with lines(0.02) as (_, (hall, _)), Poller(plant(hall, yard), mastership=mastership) as poller:
@@ -362,9 +356,9 @@ def test_a_port_handled_by_pyserial_is_refused_and_changes_nothing(mastership: M
 
 def test_a_new_mastership_listens_again_before_its_first_request(mastership: Mastership) -> None:
     hold(mastership)
-    wire = Wire([simulated(Quick(1))], unpaced=True)
+    wire = Wire([simulated(QuickToy(1))], unpaced=True)
     with Simulator([wire]), Bus(wire.path, mastership=mastership) as bus:
-        pump = bus.attach(Quick(1))
+        pump = bus.attach(QuickToy(1))
         pump.read(CURRENT)
         mastership.end()
         hold(mastership)
@@ -379,7 +373,7 @@ def test_ports_open_and_close_without_pauses(mastership: Mastership, monkeypatch
     pauses_s: list[float] = []
     monkeypatch.setattr(protocol_socket, "time", SimpleNamespace(sleep=pauses_s.append))
     hold(mastership)
-    sims = [simulated(Quick(1)) for _ in range(64)]
+    sims = [simulated(QuickToy(1)) for _ in range(64)]
     wires = [Wire([sim], unpaced=True, port="socket://127.0.0.1:0") for sim in sims]
     with Simulator(wires) as simulator:
         declared = [

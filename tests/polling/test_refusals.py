@@ -205,19 +205,10 @@ POLLED = ("output_frequency", "output_current", "mystery", "fault", "status")
 REFUSED = Toy.mystery
 
 
-class Stubborn(SimulatedDrive):
-    """A drive that refuses every read which includes the register REFUSED."""
-
-    def read(self, function: int, start: int, count: int) -> list[int]:
-        if start <= REFUSED.address < start + count:
-            raise Refusal(Reason.READ_ADDRESS)
-        return super().read(function, start, count)
-
-
 @pytest.mark.slow
 @patient
 def test_a_refused_register_is_skipped_and_its_neighbours_are_polled() -> None:
-    with Simulator([Wire([Stubborn(Toy(1))], unpaced=True)]) as simulator:
+    with Simulator([Wire([Picky(Toy(1), {REFUSED.address})], unpaced=True)]) as simulator:
         drive = Toy(1, name="pump-1")
         polls = tuple(Polled(drive.register(name), None) for name in POLLED)
         line = PlantLine("hall-1", simulator.wires[0].path, None, None, (PolledDrive(drive, polls),))

@@ -11,14 +11,13 @@ from itertools import pairwise
 import pytest
 from clocked_lines import ClockedLines, ClockedWire, S
 from lines import plant, polled, rows_of
-from toy import Toy
+from toy import Picky, Toy
 
 from multidrop.plant.model import PolledDrive
 from multidrop.poller import Poller
 from multidrop.polling.batch import Row
 from multidrop.polling.polled_line import PolledLine
 from multidrop.sim import EncodedDrive, Faults, SimulatedDrive, proof
-from multidrop.sim.drive import Reason, Refusal
 
 CURRENT, FREQUENCY, FAULT, STATUS = (
     Toy.registers[name] for name in ("output_current", "output_frequency", "fault", "status")
@@ -164,18 +163,11 @@ def test_skipped_time_slots_stay_counted_after_a_change_of_the_rate() -> None:
     assert after >= before > 0
 
 
-class Stubborn(EncodedDrive):
-    """A drive that refuses every read which includes its register `fault`."""
-
-    def read(self, function: int, start: int, count: int) -> list[int]:
-        if start <= FAULT.address < start + count:
-            raise Refusal(Reason.READ_ADDRESS)
-        return super().read(function, start, count)
-
-
 def test_a_register_that_the_drive_refuses_is_still_skipped_at_a_new_rate() -> None:
     pump = toy()
-    with ClockedLines(ClockedWire([Stubborn(pump)], Faults()), [polled(pump, ALL, 0.1)]) as made:
+    with ClockedLines(
+        ClockedWire([Picky(pump, {FAULT.address})], Faults()), [polled(pump, ALL, 0.1)]
+    ) as made:
         made.run(3)
         assert only_line(made).summary()["set_aside"] == ["pump-1.fault"]
         made.poller.set_rate(pump, None, 0.2)

@@ -23,7 +23,7 @@ from lines import Own, until
 from peers import require_module, require_program
 from ptys import opened, receive
 from tables import table
-from toy import Toy
+from toy import QuickToy, Toy
 
 from multidrop import YD1000, Bus, NoReply
 from multidrop.core import Framing, Message, build_request, parse_reply, reply_length, set_settings
@@ -253,10 +253,6 @@ class Ill(Exception):
     """Raised by a simulated drive in a test."""
 
 
-class Brief(Toy):
-    response_timeout = 0.05
-
-
 class IllDrive(EncodedDrive):
     def receive(self, frame: Any) -> Any:
         raise Ill("of this drive")
@@ -270,7 +266,7 @@ def test_simulated_drive_that_fails_does_not_disturb_other_lines(caplog: pytest.
         with simulator, Bus(wires[0].path) as ill, Bus(wires[1].path) as well:
             for _ in range(2):
                 with pytest.raises(NoReply):
-                    (ill.drives[0] if ill.drives else ill.attach(Brief, 1)).read(Toy.output_current)
+                    (ill.drives[0] if ill.drives else ill.attach(QuickToy, 1)).read(Toy.output_current)
                 drive = well.drives[0] if well.drives else well.attach(Toy, 1)
                 drive.read(Toy.output_current)
             assert isinstance(simulator.failure, Ill)

@@ -11,7 +11,7 @@ from lines import PATIENCE, line, patient, plant, polled, rows_of, until
 from motors import LINES, of_one_variant
 from stories import PathWire, bus_over, constant, read_truly
 from tables import table
-from toy import Toy
+from toy import QuickToy, Toy
 
 from multidrop import Bus, NoReply, Poller
 from multidrop.core import build_request
@@ -21,13 +21,7 @@ from multidrop.sim import EncodedDrive, Faults, SimulatedDrive, Simulator, Wire,
 from multidrop.transport import peers
 
 
-class Quick(Toy):
-    """A drive with a short timeout."""
-
-    response_timeout = 0.05
-
-
-class Successor(Quick):
+class Successor(QuickToy):
     """A drive of another family at the same address."""
 
     model = "successor"
@@ -50,7 +44,7 @@ class HoldingWire(Wire):
 
 @pytest.fixture
 def sim() -> SimulatedDrive:
-    sim = simulated(Quick(1))
+    sim = simulated(QuickToy(1))
     sim["output_current"], sim["mystery"] = 1.11, 7777
     return sim
 
@@ -65,20 +59,20 @@ def wire(sim: SimulatedDrive) -> Iterator[HoldingWire]:
 def leave_a_reply_behind(wire: HoldingWire, port: str) -> None:
     """Send a request whose reply is held back, and close the bus."""
     with Bus(port) as bus:
-        pump = bus.attach(Quick, 1)
-        assert pump.read(Quick.output_current) == 1.11
+        pump = bus.attach(QuickToy, 1)
+        assert pump.read(QuickToy.output_current) == 1.11
         wire.holds = True
         with pytest.raises(NoReply):
-            bus._exchanges.values(pump, [Quick.mystery], 1)
+            bus._exchanges.values(pump, [QuickToy.mystery], 1)
         assert bus.peer(pump).owes
 
 
-@pytest.mark.parametrize("family", [Quick, Successor])
+@pytest.mark.parametrize("family", [QuickToy, Successor])
 def test_a_late_reply_on_a_reopened_port_is_not_read_as_another_register(
     wire: HoldingWire, family: type[Toy], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     leave_a_reply_behind(wire, wire.path)
-    monkeypatch.setattr(Quick, "response_timeout", PATIENCE)  # long enough for a busy computer
+    monkeypatch.setattr(QuickToy, "response_timeout", PATIENCE)  # long enough for a busy computer
     with Bus(wire.path) as bus:
         pump = bus.attach(family, 1)
         assert bus.peer(pump).owes
@@ -88,9 +82,9 @@ def test_a_late_reply_on_a_reopened_port_is_not_read_as_another_register(
 
 def test_a_late_reply_on_a_reopened_port_is_not_polled_as_another_register(wire: HoldingWire) -> None:
     leave_a_reply_behind(wire, wire.path)
-    drive = Quick(1, name="pump")
+    drive = QuickToy(1, name="pump")
     values: set[float] = set()
-    with Poller(plant(line(wire.path, polled(drive, [Quick.output_current])))) as poller:
+    with Poller(plant(line(wire.path, polled(drive, [QuickToy.output_current])))) as poller:
         until(lambda: values.update(row.value for row in rows_of(poller) if row.value is not None) or values)
     assert values == {1.11}
 
@@ -100,7 +94,7 @@ def test_late_replies_are_recognised_under_another_port_name(wire: HoldingWire, 
     link.symlink_to(wire.path)
     leave_a_reply_behind(wire, str(link))
     with Bus(wire.path) as bus:
-        assert bus.peer(bus.attach(Quick, 1)).owes
+        assert bus.peer(bus.attach(QuickToy, 1)).owes
 
 
 def test_a_new_pseudo_terminal_with_a_used_number_has_another_identity() -> None:
@@ -119,7 +113,7 @@ def test_a_new_pseudo_terminal_with_a_used_number_has_another_identity() -> None
 @patient  # on a busy computer, the reply to the first attempt would come late
 def test_a_drive_without_late_replies_is_not_remembered(wire: HoldingWire) -> None:
     with Bus(wire.path) as bus:
-        bus.attach(Quick, 1).read(Quick.output_current)
+        bus.attach(QuickToy, 1).read(QuickToy.output_current)
     assert not peers.identities_of(wire.path) & peers._former.keys()
 
 

@@ -64,7 +64,6 @@ class Console:
         return self._status is not None
 
     def until(self, met: Callable[[], object]) -> None:
-        """Wait for a condition."""
         end = time.monotonic() + PATIENCE_S
         while not met():
             self._hear()

@@ -83,6 +83,12 @@ class PatientToy(Toy):
     response_delay = 15.0  # s; a learned timeout is at least four times this delay
 
 
+class QuickToy(Toy):
+    """A toy with a short timeout."""
+
+    response_timeout = 0.05
+
+
 class Unsure(Toy):
     """A toy without an `identify` script."""
 
