@@ -164,7 +164,7 @@ void md_waiter_remove(struct md_waiter *waiter, int fd);
  * their number. */
 int md_waiter_wait(struct md_waiter *waiter, void **ready, int room, int64_t timeout_ns);
 
-/* ---- termios.c ---- */
+/* ---- serial.c ---- */
 
 int md_port_keep_rts(int fd); /* leave RTS unchanged when the port is closed; return 0 or -errno */
 

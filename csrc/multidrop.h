@@ -78,7 +78,7 @@ int md_parse_reply(int framing, const uint8_t *bytes, size_t len, const struct m
 /* Return the length of a good reply to `request`; 0 if the request is a broadcast. */
 int md_reply_length(int framing, const struct md_message *request);
 
-/* ---- termios.c: return 0, -errno, or a mask of enum md_refusal ---- */
+/* ---- serial.c: return 0, -errno, or a mask of enum md_refusal ---- */
 
 struct md_settings {
     uint32_t baudrate;
@@ -101,8 +101,6 @@ int md_port_set(int fd, const struct md_settings *settings);
 int md_port_get(int fd, struct md_settings *settings);
 /* Return the baud rate of divisor 1, from which the UART derives all others; 0: unknown. */
 uint32_t md_port_baud_base(int fd);
-
-/* ---- closing.c: return 0 or -errno ---- */
 
 /* Close the port behind `fd`, which then refers to the file of `other`. The driver has `most_ns` to send its
  * remaining bytes; then it discards them. */

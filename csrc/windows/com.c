@@ -3,6 +3,7 @@
 #include "../engine.h"
 
 #include <errno.h>
+#include <io.h>
 #include <string.h>
 
 static void CALLBACK port_has_read(DWORD error, DWORD got, OVERLAPPED *reading)
@@ -103,6 +104,12 @@ int md_port_keep_rts(int fd)
 {
     (void)fd;
     return -EOPNOTSUPP;
+}
+
+int md_port_close(int fd, int other, int64_t most_ns)
+{
+    (void)most_ns;
+    return dup2(other, fd) < 0 ? -errno : 0;
 }
 
 /* ---- one setting after another, to find the refused ones ---- */

@@ -88,7 +88,7 @@ def test_a_command_that_waits_too_long_for_rts_is_cancelled(build: Callable[...,
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the driver is Linux's")
 def test_a_baud_rate_without_an_integer_divisor_is_refused(build: Callable[..., None]) -> None:
-    build("test_divisors", "termios")
+    build("test_divisors", "serial")
 
 
 @WAITS_BY_EPOLL
