@@ -37,7 +37,7 @@ from multidrop.polling import line_set
 from multidrop.polling.batch import Row
 from multidrop.polling.polled_line import PolledLine
 from multidrop.sim import EncodedDrive, Faults, SimulatedDrive, Simulator, Wire, simulated
-from multidrop.transport import clock
+from multidrop.transport import clock, open_port
 
 NOT_SENT = {str(Status.NOT_ASKED), str(Status.LATE_ANSWER_DUE)}
 
@@ -670,3 +670,28 @@ print(re.search(r"VmHWM:\\s+(\\d+) kB", Path("/proc/self/status").read_text())[1
 def test_a_recording_poller_of_31_drives_uses_at_most_30_mb() -> None:
     ran = subprocess.run([sys.executable, "-c", POLLER], capture_output=True, text=True, check=True)
     assert 5.0 < int(ran.stdout) / 1024 <= MOST_MB
+
+
+def test_closing_waits_for_the_stalled_adapters_of_all_lines_together(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Each adapter has the same 0.75 s from the end of polling, not 0.75 s after the previous one."""
+    waits: list[float] = []
+
+    def close(fd: int, other: int, seconds: float) -> None:
+        waits.append(seconds)
+        time.sleep(seconds)
+        os.dup2(other, fd)
+
+    ends = [os.openpty() for _ in range(3)]
+    try:
+        with Poller(plant(*(line(os.ttyname(end), name=str(end)) for _, end in ends))):
+            monkeypatch.setattr(Serial, "out_waiting", 8)
+            monkeypatch.setattr(open_port, "close_behind", close)
+    finally:
+        for end in (end for both in ends for end in both):
+            os.close(end)
+    assert len(waits) == len(ends)
+    assert sum(waits) <= open_port.CLOSING_S
+    assert waits[-1] == 0
+    assert "its adapter takes no bytes; they are discarded" in caplog.text

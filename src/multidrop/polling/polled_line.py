@@ -532,6 +532,7 @@ class PolledLine:
     def close(self, why: str) -> None:
         """Add miss rows for slots that ended unsent; close the bus. Later calls fail with text `why`."""
         self.bus.line.why_closing = why
+        self.bus.line.ended_ns = self._ended_ns
         with self._lock:
             try:
                 self._miss_what_is_over(self._ended_ns or clock.now_ns())

@@ -44,6 +44,7 @@ MISCOUNTS = (
     "%s: its driver counts unsent bytes although replies came; the count is ignored, so a stall of the port "
     "will not be noticed"
 )
+DISCARDED = "its adapter takes no bytes; they are discarded"
 FOREIGN = "%s: another master: %d unexpected bytes came; only stops are sent until the line has been silent"
 MOST_LOSSES = 5  # limit of the losses of a port that are logged within LOSSES_NS
 LOSSES_NS = 60_000_000_000
@@ -109,10 +110,10 @@ class LineLog:
             again = " again" if self._is_lost else ""
             log_aside(_log, logging.WARNING, "%s: not opened%s: %s", self._port, again, why)
 
-    def holds_bytes(self) -> None:
+    def holds_bytes(self, seconds: float) -> None:
         """Log that the port is being closed although the driver still holds bytes."""
-        said = "%s: waiting %g s for its adapter, which takes no bytes; then they are discarded"
-        log_aside(_log, logging.WARNING, said, self._port, CLOSING_S)
+        wait = f"waiting {seconds:.2g} s for its adapter, which takes no bytes; then they are discarded"
+        log_aside(_log, logging.WARNING, "%s: %s", self._port, wait if seconds else DISCARDED)
 
     def closed(self) -> None:
         log_aside(_log, logging.INFO, "%s: closed", self._port)
@@ -184,6 +185,8 @@ class Line:
         self._why_lost: str | None = None
         # why calls fail although the line is not closed yet; None: they do not fail
         self.why_closing: str | None = None
+        # When polling ended; None: not yet. Stalled adapters of several lines then have the same CLOSING_S.
+        self.ended_ns: int | None = None
         self._make_locks()
         register_at_fork(self)
 
@@ -274,9 +277,15 @@ class Line:
     def _let_go(self) -> None:
         with self._lock:
             self.drop()
+            seconds = self._closing_s()
             if not self._opened.must_discard and self._opened.holds_bytes():
-                self._log.holds_bytes()
-            self._opened.close()
+                self._log.holds_bytes(seconds)
+            self._opened.close(seconds)
+
+    def _closing_s(self) -> float:
+        """Return how long closing the port may wait for its adapter, in s."""
+        past_ns = clock.now_ns() - self.ended_ns if self.ended_ns else 0
+        return max(0.0, CLOSING_S - past_ns / 1e9)
 
     @undisturbed
     def reopen(self) -> None:

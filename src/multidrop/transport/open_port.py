@@ -348,10 +348,10 @@ class OpenPort:
         clock.sleep(_UNNOTICED_S)
         return self._holds_bytes_now()
 
-    def close(self) -> None:
+    def close(self, seconds: float = CLOSING_S) -> None:
         """Close the port, even if opening it failed halfway.
 
-        The adapter has CLOSING_S seconds to accept the driver's bytes; then the rest is discarded. With
+        The adapter has `seconds` s to accept the driver's bytes; then the rest is discarded. With
         `must_discard`, all bytes are discarded now.
         """
         if self.bridge:
@@ -362,7 +362,7 @@ class OpenPort:
             if self._holds_bytes_now():  # pyserial would wait for up to 30 s until these bytes are sent
                 port = cast(serial.Serial, self._serial)
                 other = cast(int, port.pipe_abort_read_r)
-                close_behind(port.fileno(), other, 0.0 if self.must_discard else CLOSING_S)
+                close_behind(port.fileno(), other, 0.0 if self.must_discard else seconds)
             with suppress(*PORT_FAILURES):
                 self._serial.close()
             self.must_discard = False
