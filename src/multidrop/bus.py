@@ -11,7 +11,7 @@ from multidrop.control.attached import Attached, Leaving, made
 from multidrop.control.call import Latches, check_expiry
 from multidrop.control.eeprom_ledger import Ledger
 from multidrop.control.exit_hook import give_signals_back, without_internals
-from multidrop.control.outcome import Stopped
+from multidrop.control.outcome import Seen, Stopped
 from multidrop.control.performer import Broadcaster, Performer
 from multidrop.control.records import AuditLog, WriteRecords
 from multidrop.control.stops import Stopper, StopRun
@@ -141,7 +141,7 @@ class Bus:
         self._performer = Performer(self._exchanges, self._writer, self._stopper, self._latches, expiry)
         self._broadcaster = Broadcaster(self._writer, self._performer, self._latches)
         self._meter = LineMeter(self._exchanges)
-        self._leaving = Leaving(self._latches, self._stopper, self.stop_all, lambda: self.drives)
+        self._leaving = Leaving(self._latches, self._stopper, self.stop_all, self._motors)
         self._is_closed = False
         self._closing = threading.Lock()
         self._attached = Attached(self, self._exchanges, self._latches, self._performer, self._stopper)
@@ -315,9 +315,9 @@ class Bus:
         sent first. Then each drive in turn is sent its stop. A stop is repeated until the motor is seen to
         stand still, for at most `seconds`. By default it is repeated for 30 s, and the last repetition may
         last as long as the motor's ramp. An invalid `seconds` is logged and ignored. The failure of one
-        drive's stop is in its result, and never ends the other stops. Calls that move a motor, made before or
-        during this call, raise CancelledByStop. If this call is interrupted, each drive whose motor is not
-        seen to stand still gets one more stop.
+        drive's stop is in its result, and never ends the other stops. A device with `has_motor = False` gets
+        no stop. Calls that move a motor, made before or during this call, raise CancelledByStop. If this call
+        is interrupted, each drive whose motor is not seen to stand still gets one more stop.
         """
         run: StopRun | None = None
         tried = 0
@@ -332,10 +332,14 @@ class Bus:
                     continue
                 (run or self._all_called(seconds)).interrupted(failure)
                 raise
-        return run.found()
+        without = [drive.name for drive in self.drives if not drive.has_motor]
+        return run.found() | {name: Stopped(name, Seen.NO_MOTOR, 0.0) for name in without}
+
+    def _motors(self) -> list[Drive]:
+        return [drive for drive in self.drives if drive.has_motor]
 
     def _all_called(self, seconds: float | None) -> StopRun:
-        peers = self.peers
+        peers = {drive: peer for drive, peer in self.peers.items() if drive.has_motor}
         is_known = self._writer.identity_check.is_known
         in_turn = sorted(peers, key=lambda drive: (not is_known(drive), peers[drive].failures))
         return self._stopper.stop_all(in_turn, lambda: self._broadcaster.stop(self.drives), seconds)

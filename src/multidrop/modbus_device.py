@@ -44,6 +44,7 @@ class ModbusDevice(Drive):
     title = "Modbus device"
     framings = (Framing.RTU, Framing.ASCII)
     addresses = range(256)
+    has_motor = False  # for each write, the user confirms that it cannot start a motor
     response_timeout = 1.0
 
     def read_holding(

@@ -16,12 +16,14 @@ from motors import MAKE, STARTS
 from simulated_bus import EXCHANGE_TIME, TIMEOUT, SimulatedBus, is_write, one
 from stop_frames import STOPS, Meanwhile, Own, che_drives, first, plain_stop, started_while, writes
 
+from multidrop.control.commands import stop_drive
 from multidrop.control.eeprom_ledger import Ledger
 from multidrop.control.outcome import Seen
 from multidrop.control.ramp import ramp, start_staggered
 from multidrop.control.stops import AT_ONCE, LEAST_S, PAUSE_S
 from multidrop.core import Completion, Exchange, Message
 from multidrop.drive import Condition, Drive, Script, read, wait, write
+from multidrop.drive.register import reading
 from multidrop.drive.verbs import verb
 from multidrop.errors import CancelledByStop, DriveException, LineError, PortLost, Unconfirmed
 from multidrop.families import YD1000, DelixiModbus, ErmanERG220, InnovertIBD, InvtCHE
@@ -598,3 +600,25 @@ def test_a_refused_stop_is_not_reported_as_unsent() -> None:
     with pytest.raises(DriveException):
         drive.stop(seconds=1)
     assert any(text.startswith(f"{drive.name}: the stop was sent, but is not yet confirmed") for text in told)
+
+
+class Meter(Drive):
+    has_motor = False
+    power = reading(1, "W")
+
+
+def test_a_stop_of_a_whole_line_skips_a_device_without_a_motor(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    line = SimulatedBus(simulated(YD1000(1)), simulated(Meter(2)))
+    line.attach(YD1000(1, name="pump"))
+    meter = line.attach(Meter(2, name="meter"))
+    line.bus.stop_on_exit()
+    results = line.bus.stop_all()
+    assert results["pump"].seen is Seen.STOPPED
+    assert (str(results["meter"]), results["meter"].ok) == ("meter: has no motor", True)
+    assert str(stop_drive(meter, None)["meter"].outcome) == "done"
+    line.bus.close()
+    flush(1.0)
+    assert not [request for request, _ in line.frames if request.address == 2]
+    assert caplog.text == ""

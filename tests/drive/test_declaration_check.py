@@ -366,6 +366,7 @@ WRONG_FACTS: list[tuple[str, Any, str]] = [
     ("readable_gaps", {HOLDING: 16}, "readable_gaps = "),
     ("broadcasts", "no", "broadcasts = 'no' is neither True nor False"),
     ("answers_every_read", 1, "answers_every_read = 1 is neither True nor False"),
+    ("has_motor", None, "has_motor = None is neither True nor False"),
     ("watchdog", None, "watchdog = None is not a text"),
     ("setpoint_name", 5, "setpoint_name = 5 is not the name of a register"),
     ("options", ("stop_time",), "options = ('stop_time',) is not a mapping"),
@@ -411,3 +412,9 @@ def test_verb_method_without_the_verb_decorator_is_reported(name: str) -> None:
 def test_mistake_in_a_subclass_of_a_built_in_family_is_reported() -> None:
     with pytest.raises(DeclarationError, match=r"^Ours\.stop: without the decorator @verb"):
         type("Ours", (InnovertIBD,), {"stop": lambda self: None})
+
+
+def test_a_class_without_a_motor_has_no_register_that_moves_one() -> None:
+    (mistake,) = mistakes_in(reset=command(0x2000), has_motor=False)
+    assert mistake == "has_motor = False, but a write to reset may move one: declare moves=False"
+    assert not declare(reset=command(0x2000, moves=False), has_motor=False).has_motor

@@ -223,8 +223,9 @@ class Leaving:
         If `stop_on_exit` was called, stop the drives `to_stop` before that wait.
         """
         self._latches.end(drives)  # cancel calls first: a start sent after the stops would not be stopped
-        if to_stop and self.stops:
-            run = self._stopper.stop_all(to_stop, lambda: False, None)
+        motors = [drive for drive in to_stop if drive.has_motor]
+        if motors and self.stops:
+            run = self._stopper.stop_all(motors, lambda: False, None)
             try:
                 run.carry_out()
             except BaseException as interruption:

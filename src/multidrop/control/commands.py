@@ -17,6 +17,7 @@ from typing import Any, NamedTuple, TypeVar
 from multidrop.control.call import written_before
 from multidrop.control.outcome import (
     Outcome,
+    Seen,
     Stopped,
     result_of_failed_stop,
     result_of_failure,
@@ -92,6 +93,8 @@ def stop_drive(drive: Drive, seconds: float | None) -> Results:
 
 def stop_drive_by(verb: str, drive: Drive, seconds: float | None) -> Results:
     """Stop one drive with this verb, such as `coast`; return a dict that maps its name to the result."""
+    if not drive.has_motor:
+        return {drive.name: result_of_stop(Stopped(drive.name, Seen.NO_MOTOR, 0.0))}
     try:
         return {drive.name: getattr(drive, verb)(seconds=seconds)}
     except Exception as failure:  # any failure: the result reports it to the caller

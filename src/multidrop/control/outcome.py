@@ -74,6 +74,7 @@ class Seen(Enum):
     SENT = "sent but unknown"
     REFUSED = "refused by the drive"  # the drive refused every repetition of the stop
     FAILED = "failed"  # no stop was sent
+    NO_MOTOR = "has no motor"  # no stop was sent, because the device has no motor
 
 
 @dataclass(frozen=True)
@@ -87,10 +88,12 @@ class Stopped:
 
     @property
     def ok(self) -> bool:
-        """True if the motor was seen to be at rest."""
-        return self.seen is Seen.STOPPED
+        """True if the motor was seen to be at rest, or the device has no motor."""
+        return self.seen in (Seen.STOPPED, Seen.NO_MOTOR)
 
     def __str__(self) -> str:
+        if self.seen is Seen.NO_MOTOR:
+            return f"{self.drive}: {self.seen.value}"
         why = f": {self.why}" if self.why else ""
         return f"{self.drive}: {self.seen.value} after {self.seconds:.1f} s{why}"
 
@@ -116,6 +119,7 @@ _STOP_OUTCOMES = {
     Seen.SENT: CommandOutcome.UNKNOWN,
     Seen.REFUSED: CommandOutcome.FAILED,
     Seen.FAILED: CommandOutcome.NOT_SENT,
+    Seen.NO_MOTOR: CommandOutcome.DONE,
 }
 SURE_OF_A_STOP = (WriteForbidden, NotMaster, Unsupported)
 
@@ -138,6 +142,8 @@ def result_of_failed_stop(failure: BaseException) -> CommandResult:
 
 def result_of_stop(stopped: Stopped) -> CommandResult:
     outcome = _STOP_OUTCOMES[stopped.seen]
+    if stopped.seen is Seen.NO_MOTOR:
+        return CommandResult(outcome, stopped.seen.value)
     if outcome is CommandOutcome.DONE:
         return CommandResult(outcome, f"stopped: seen to stand after {stopped.seconds:.1f} s")
     return CommandResult(outcome, f"{stopped.seen.value}: {stopped.why}", BusError(stopped.why))

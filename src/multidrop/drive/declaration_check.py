@@ -114,7 +114,7 @@ _TEXTS = (
     "no_broadcasts",
     "watchdog",
 )
-_TRUTHS = ("answers_every_read", "broadcasts", "identify_recognises")
+_TRUTHS = ("answers_every_read", "broadcasts", "has_motor", "identify_recognises")
 _CLASS_RULES: Rules = (
     *(
         (name, _is_number_to(most), f"is not a number of s from 0 to {most:g}")

@@ -60,8 +60,7 @@ class Drive(RegisterAccess):
 
     title: ClassVar[str] = ""
     model: ClassVar[str] = ""
-    # name of the TOML file that declares the family; such families are untested
-    declared_in: ClassVar[str] = ""
+    declared_in: ClassVar[str] = ""  # name of the family's TOML file; such families are untested
     manual: ClassVar[str] = ""
 
     # ---- the line ----
@@ -84,8 +83,7 @@ class Drive(RegisterAccess):
     # s within which the drive replies, according to its document; 0: not stated
     answering_time: ClassVar[float] = 0.0
     turnaround_delay: ClassVar[float] = 0.1  # s without requests after a broadcast
-    # least time in s from the end of a reply to the next request to the same drive
-    least_interval: ClassVar[float] = 0.0
+    least_interval: ClassVar[float] = 0.0  # s from a reply to the next request to this drive, at least
     # True if the drive answers every read of its tables, with a value or an exception
     answers_every_read: ClassVar[bool] = False
 
@@ -111,9 +109,9 @@ class Drive(RegisterAccess):
     later: ClassVar[frozenset[int]] = frozenset({5, 6})
     broadcasts: ClassVar[bool] = False  # True if the document describes broadcasts
     identify_recognises: ClassVar[bool] = False  # True if `identify` fails for every drive of another make
-    # registers in a family file whose known values identify the family
-    identity_proofs: ClassVar[tuple[Any, ...]] = ()
+    identity_proofs: ClassVar[tuple[Any, ...]] = ()  # registers by which a family file identifies the device
     options: ClassVar[Mapping[str, Option]] = {}
+    has_motor: ClassVar[bool] = True  # False for a device such as a meter: `stop_all` skips it
     setpoint_name: ClassVar[str] = "frequency"  # name of the register that set_frequency writes
     # what must be set on the keypad before the drive obeys the line
     remote: ClassVar[str] = "the drive must take its commands from the line"
@@ -136,6 +134,9 @@ class Drive(RegisterAccess):
         cls.registers = cls._declared(Register)
         cls.texts = cls._declared(Text)
         wrong = fact_errors(cls) + verb_errors(cls)
+        moving = [name for name, register in cls.registers.items() if register.commands] if not wrong else []
+        if moving and not cls.has_motor:
+            wrong.append(f"has_motor = False, but a write to {moving[0]} may move one: declare moves=False")
         options = cls.options = cls._all_options() if isinstance(cls.options, Mapping) else {}
         wrong += declaration_errors(cls.registers, TAKEN_NAMES, options) + text_errors(cls.texts, TAKEN_NAMES)
         if wrong := wrong or request_errors(cls):

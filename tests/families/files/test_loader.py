@@ -137,6 +137,12 @@ def test_family_file_can_declare_registers_written_by_function_10h(tmp_path: Pat
     assert [loaded.register(name).table.write for name in "ab"] == [0x10, 0x06]
 
 
+def test_family_file_can_declare_a_device_without_a_motor(tmp_path: Path) -> None:
+    reading = "[reading]\npower = { at = 1 }\n"
+    assert family(tmp_path, HEAD + reading).has_motor
+    assert not family(tmp_path, f"{HEAD}motor = false\n{reading}").has_motor
+
+
 def test_addresses_of_a_family_file_may_be_unit_ids_0_to_255(tmp_path: Path) -> None:
     head = HEAD + "addresses = [0, 255]\n[reading]\nlevel = { at = 1 }\n"
     loaded = family(tmp_path, head)

@@ -100,6 +100,7 @@ FAMILY_KEYS = {
     "response_delay": Key(str, 'response_delay = "10 ms"', keywords=duration_up_to(1)),
     "response_timeout": Key(str, 'response_timeout = "500 ms"', keywords=duration_up_to(1)),
     "turnaround_delay": Key(str, 'turnaround_delay = "100 ms"', keywords=duration_up_to(1)),
+    "motor": Key(bool, "motor = false, if the device has no motor"),
     "remote": Key(str, 'remote = "F0-02 must be 2"'),
     "line_parameters": Key(str, 'line_parameters = "F8-00 baud rate, F8-02 address"'),
     "watchdog": Key(str, 'watchdog = "F8-04: stops after 5 s without a request; off from the factory"'),
@@ -115,7 +116,7 @@ FAMILY_KEYS = {
     "note": Key(str, 'note = "Further facts."'),
 }
 _TEXTS = {"title": "title", "manual": "manual", "remote": "remote", "watchdog": "watchdog"}
-_TEXTS |= {"line_parameters": "line_parameters", "note": "__doc__"}
+_TEXTS |= {"motor": "has_motor", "line_parameters": "line_parameters", "note": "__doc__"}
 _DURATIONS = ("silence", "least_interval", "response_delay", "response_timeout", "turnaround_delay")
 # s; limit of the drive's pauses, because a stop of another drive may have to wait as long
 LONGEST_WAIT = 10.0
