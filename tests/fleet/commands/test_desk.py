@@ -27,6 +27,7 @@ from multidrop import InvtCHE, Stopped
 from multidrop.control import CommandOutcome, Seen, read_audit, records
 from multidrop.control.commands import RepeatedStops, Results, begin_stops, stop_drive, stop_line
 from multidrop.fleet.commands import desk as desk_module
+from multidrop.fleet.commands import log as log_module
 from multidrop.fleet.commands.desk import MOST_WRITES
 from multidrop.fleet.commands.log import CommandLog
 from multidrop.fleet.commands.messages import CommandAnswer, CommandRequest, Offered, read_answer, read_offer
@@ -593,6 +594,20 @@ async def test_log_records_keep_their_order_and_are_refused_after_the_close(tmp_
         await log.note({})
     lines = (tmp_path / "commands.jsonl").read_text().splitlines()
     assert [line.partition('"step": ')[2] for line in lines] == ["0}", "1}", "2}", "3}", "4}"]
+
+
+async def test_few_records_wait_for_a_hanging_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    disk, log = threading.Event(), CommandLog(tmp_path / "commands.jsonl")
+    monkeypatch.setattr(log_module, "MOST_WAITING", 2)
+    with patch.object(CommandLog, "_add", lambda *record: disk.wait()):
+        waiting = [asyncio.create_task(log.note({})) for _ in range(2)]
+        await asyncio.sleep(0)
+        with pytest.raises(OSError, match=r"commands\.jsonl: 2 records wait for the disk"):
+            await log.note({})
+        disk.set()
+        await asyncio.gather(*waiting)
+        await log.note({})
+    log.close()
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import threading
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -15,7 +16,9 @@ from tables import table
 
 from multidrop.control import CommandOutcome, read_audit
 from multidrop.fleet.commands import fleet_commands
+from multidrop.fleet.commands import log as log_module
 from multidrop.fleet.commands.fleet_commands import FleetCommands
+from multidrop.fleet.commands.log import CommandLog
 from multidrop.fleet.commands.messages import CommandAnswer
 from multidrop.fleet.errors import FleetError, MayNotSend, NobodyThere, NotDelivered, OutcomeUnknown
 from multidrop.fleet.servers.buckets import Record
@@ -289,6 +292,29 @@ def test_a_full_disk_blocks_commands_but_not_stops(tmp_path: Path) -> None:
         assert "asked.jsonl: No space left on device" in told.text
         assert asked(tmp_path, path, stop).outcome is DONE
     assert path.asked == ["stop"]
+
+
+def test_a_hanging_disk_blocks_commands_but_delays_no_stop(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    disk = threading.Event()
+    path = ScriptedPath(cmd=[OFFER], do=[IT_IS_DONE], stop=[IT_IS_DONE])
+    monkeypatch.setattr(CommandLog, "_add", lambda *record: disk.wait())
+
+    async def stop_and_write(client: FleetCommands) -> CommandAnswer:
+        try:
+            async with asyncio.timeout(60):
+                assert [(await stop(client)).outcome for _ in range(2)] == [DONE] * 2
+                assert path.asked == ["stop"] * 2
+                monkeypatch.setattr(log_module, "WRITING_S", 0.0)
+                return await write(client)
+        finally:
+            disk.set()
+
+    told = asked(tmp_path, path, stop_and_write)
+    assert told.outcome is NOT_SENT
+    assert told.text.endswith("asked.jsonl: not written within 0 s; does the disk answer?")
+    assert path.asked == ["stop"] * 2
 
 
 def test_a_log_that_cannot_be_opened_blocks_commands_but_not_stops(tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ from multidrop.fleet.servers.connections import ServerPath, paths_of
 from multidrop.fleet.servers.setup import open_all
 from multidrop.plant import drive_meant
 from multidrop.printable import did_you_mean
-from multidrop.supervisor import Ended, end_tasks, reason_of
+from multidrop.supervisor import Ended, end_tasks, reason_of, supervisor
 
 LOST_S = 6.0  # time limit without any answer, after which a command's result is reported as unknown
 AGAIN_S = 0.2
@@ -63,6 +63,7 @@ class FleetCommands:
         self._paths = paths_of(urls, options)
         self._log = CommandLog(log)
         self._keeping: list[asyncio.Task[None]] = []
+        self._noting: set[asyncio.Task[None]] = set()  # records that are being written
         self._plant = Follower(Bucket(names.PLANT, self._path))
 
     async def __aenter__(self) -> Self:
@@ -88,6 +89,8 @@ class FleetCommands:
         await end_tasks(*self._keeping)
         for path in self._paths:
             await path.close()
+        if self._noting:
+            await asyncio.wait(self._noting)
         self._log.close()
 
     # ---- commands ----
@@ -132,7 +135,7 @@ class FleetCommands:
             answer = CommandAnswer(CommandOutcome.NOT_SENT, why)
         else:
             answer = await self._do(offered)
-        await self._note_end(record, answer)
+        self._note_aside({"step": "over", **answer.as_json(), **record})
         return answer
 
     async def _offer(self, line: str, request: CommandRequest) -> Offered | CommandAnswer:
@@ -251,12 +254,11 @@ class FleetCommands:
         request = StopRequest(uuid.uuid4().hex, by, None if drives is None else tuple(drives))
         what = f"the stop of {', '.join(drives) if drives else f'all drives of line {line}'}"
         record = {"id": request.id, "line": line, "what": what, "by": by}
-        noting = asyncio.create_task(self._note_end(record, None))
+        self._note_aside({"step": "asked", **record})
         answer = await _first_answer(self._paths, line, request, what, on_news)
         lost = f"the result of {what} is unknown: its gateway no longer answers; {HARD_WIRED}"
         answer = await self._end_of(answer, names.stop_subject(line), encode(request), lost, on_news)
-        await noting
-        await self._note_end(record, answer)
+        self._note_aside({"step": "over", **answer.as_json(), **record})
         return answer
 
     # ---- the plant, and the log ----
@@ -298,10 +300,15 @@ class FleetCommands:
         hint = did_you_mean(drive, names, "`multidrop fleet lines` lists its lines")
         raise ValueError(f"the fleet's plant has no drive {drive!r}; {hint}")
 
-    async def _note_end(self, record: Mapping[str, Any], answer: CommandAnswer | None) -> None:
-        more = {"step": "asked"} if answer is None else {"step": "over", **answer.as_json()}
+    def _note_aside(self, record: Mapping[str, Any]) -> None:
+        """Log a record in a task, so that a slow disk delays no stop and no result."""
+        noting = supervisor().start("record of a command", self._note(record))
+        self._noting.add(noting)
+        noting.add_done_callback(self._noting.discard)
+
+    async def _note(self, record: Mapping[str, Any]) -> None:
         try:
-            await self._log.note({**more, **record})
+            await self._log.note(record)
         except OSError as failure:
             _log.warning(
                 "a record of a command or stop was not written to %s: %s",
