@@ -29,16 +29,23 @@ from multidrop import PlantError
 from multidrop.exposition import expose_metrics
 from multidrop.fleet import gateway as fleet_gateway
 from multidrop.fleet.commands.fleet_commands import FleetCommands
+from multidrop.fleet.errors import FleetError
 from multidrop.fleet.followed import FollowedFleet
 from multidrop.fleet.gateway import FleetGateway
+from multidrop.fleet.leases.lease import LifeLock
 from multidrop.fleet.metrics import MOST_CLIENTS, MOST_HEAD, answer, families_of, listen, serving
 from multidrop.fleet.overview import FleetView, FleetWatch
 from multidrop.fleet.page_part import FleetPart
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.connections import ServerPath
 from multidrop.gateway.settings import read_settings
+from multidrop.samples import Spool
 
 PATIENCE_S = 60.0
+
+
+def fail() -> None:
+    raise OSError("it fails")
 
 
 class Asked:
@@ -128,6 +135,47 @@ async def test_closing_lines_cancels_their_timer(tmp_path: Path, monkeypatch: py
         assert (held, gateway.mastership.until_ns) == ([True], 0)
     finally:
         gateway.mastership.end()
+
+
+async def test_lines_that_fail_to_close_keep_their_timer_and_the_lock(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The process could still send, so no other process may believe that it is dead."""
+    gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
+    gateway.mastership.extend(time.clock_gettime_ns(time.CLOCK_BOOTTIME) + 3600 * 10**9)
+    close = gateway.lines.poller.close
+    monkeypatch.setattr(gateway.lines.poller, "close", fail)
+    with pytest.raises(OSError, match="it fails"):
+        await gateway._close()
+    try:
+        assert gateway.mastership.holds
+        with pytest.raises(FleetError, match="another gateway of this machine"):
+            LifeLock(tmp_path / "gw-1.lock")
+        Spool(tmp_path / "spool", "gw-1").close()
+        with pytest.raises(OSError, match="is closed"):
+            await gateway.log.note({})
+    finally:
+        gateway.mastership.end()
+        close()
+        gateway.lock.close()
+
+
+@pytest.mark.parametrize("part", ["paths", "spool", "log"])
+async def test_a_part_that_fails_to_close_keeps_no_other_part_open(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: str
+) -> None:
+    gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
+    gateway.mastership.extend(time.clock_gettime_ns(time.CLOCK_BOOTTIME) + 3600 * 10**9)
+    failing = gateway.paths[0] if part == "paths" else getattr(gateway, part)
+    close = failing.close
+    monkeypatch.setattr(failing, "close", fail)
+    with pytest.raises(OSError, match="it fails"):
+        await gateway._close()
+    assert gateway.mastership.until_ns == 0
+    LifeLock(tmp_path / "gw-1.lock").close()
+    if part == "spool":
+        close()
+    Spool(tmp_path / "spool", "gw-1").close()
 
 
 @pytest.mark.long

@@ -7,7 +7,7 @@ import json
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from functools import partial
 from math import inf
 from pathlib import Path
@@ -164,13 +164,20 @@ class FleetGateway:
             await asyncio.sleep(ENDING_S)
 
     async def _close(self) -> None:
-        for path in self.paths:
-            await path.close()
-        self.lines.poller.close()
-        self.mastership.end()
-        self.spool.close()
-        self.log.close()
-        self.lock.close()
+        """Close everything, even if one part fails to close.
+
+        If the lines fail to close, this process could still send. Then the kernel's timer stays set, and the
+        lock is held until the process ends.
+        """
+        with ExitStack() as last, ExitStack() as files:
+            files.callback(self.log.close)
+            files.callback(self.spool.close)
+            try:
+                await asyncio.gather(*(path.close() for path in self.paths))
+            finally:
+                self.lines.poller.close()
+                self.mastership.end()
+                last.callback(self.lock.close)
 
     # ---- requests ----
 
