@@ -11,6 +11,7 @@ import threading
 from collections.abc import Iterable, Iterator
 from contextlib import closing, suppress
 from pathlib import Path
+from time import tzset
 from typing import Any
 
 import pytest
@@ -439,3 +440,13 @@ def test_a_lost_port_ends_sniffing_with_a_sentence(run: Run) -> None:
     os.close(slave)
     assert status == 1
     assert err.splitlines()[-1].startswith(f"multidrop: {port}: the port was lost (")
+
+
+def test_decode_prints_times_of_day_in_utc(run: Run, capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    try:
+        monkeypatch.setenv("TZ", "America/New_York")
+        tzset()
+        assert run("decode", capture)[1].startswith("22:13:20.000000Z  address 1  reads ")
+    finally:
+        monkeypatch.undo()
+        tzset()

@@ -10,7 +10,7 @@ import struct
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import UTC, datetime
 from typing import Any
 
 from multidrop.capture.pairing import Junk, Sniffed, SniffedExchange
@@ -295,8 +295,9 @@ def data_of(exchange: SniffedExchange, request: Message) -> bytes:
 
 
 def _clock(time_ns: int) -> str:
-    """Return the local time of day with microseconds, such as 09:30:00.123456."""
-    return f"{datetime.fromtimestamp(time_ns // 10**9).strftime('%H:%M:%S')}.{time_ns % 10**9 // 1000:06}"
+    """Return the time of day (UTC) with microseconds, such as 09:30:00.123456Z."""
+    second, rest_ns = divmod(time_ns, 10**9)
+    return f"{datetime.fromtimestamp(second, UTC):%H:%M:%S}.{rest_ns // 1000:06}Z"
 
 
 def _delay(exchange: SniffedExchange) -> str:
