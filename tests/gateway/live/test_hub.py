@@ -512,3 +512,16 @@ def test_home_assistant_gets_no_display_precision_for_a_float_register() -> None
     shown = [parts[name].get("suggested_display_precision") for name in ("pressure", "level", "power")]
     assert shown == [None, 2, None]
     assert [parts[f"{name}_set"]["step"] for name in ("pressure", "level")] == [0.001, 0.01]
+
+
+def test_values_stay_current_for_the_cycle_of_the_reloaded_line(clock: HubClock) -> None:
+    """A reload adds drives to a line, and removes them. The first drive stays the same object."""
+    first = polled(InvtCHE(1, name="pump-1"), [InvtCHE.output_frequency])
+    others = [polled(InvtCHE(address), InvtCHE.readings()) for address in range(2, 20)]
+    alone, crowded = plant(line("/dev/none", first)), plant(line("/dev/none", first, *others))
+    hub = Hub(alone, clock)
+    for one in (crowded, alone):
+        hub.adopt(one)
+        assert hub.holds_s("pump-1", "output_frequency") == Hub(one).holds_s("pump-1", "output_frequency")
+    assert Hub(alone).holds_s("pump-1", "output_frequency") == 1.0
+    assert (Hub(crowded).holds_s("pump-1", "output_frequency") or 0.0) > 2.0

@@ -52,9 +52,9 @@ class RegisterRows:
 
     __slots__ = ("good", "holds_ns", "newest", "register", "since_ns")
 
-    def __init__(self, register: Register[Any], period_s: float, since_ns: int) -> None:
+    def __init__(self, register: Register[Any], since_ns: int) -> None:
         self.register = register
-        self.holds_ns = round(current_for(period_s) * 1e9)  # how long a value stays current
+        self.holds_ns = 0  # how long a value stays current
         # rows requested before this time are ignored, because they are from another drive of the same name
         self.since_ns = since_ns
         self.newest: KeptRow | None = None
@@ -133,27 +133,31 @@ class _Trip(NamedTuple):
     at_ns: int
 
 
-def _rows_of(polls: Iterable[Polled], cycle_s: float, since_ns: int) -> dict[str, RegisterRows]:
-    return {
-        poll.register.name: RegisterRows(poll.register, max(cycle_s, poll.every or 0.0), since_ns)
-        for poll in polls
-    }
+def _rows_of(polls: Iterable[Polled], since_ns: int) -> dict[str, RegisterRows]:
+    return {poll.register.name: RegisterRows(poll.register, since_ns) for poll in polls}
 
 
 class _WatchedDrive:
     """One drive of the plant, with the newest rows of its polled registers."""
 
-    def __init__(self, polled: PolledDrive, cycle_s: float, since_ns: int) -> None:
+    def __init__(self, polled: PolledDrive, since_ns: int) -> None:
         self.polled = polled
         self.reader = StateReader(polled.drive)
         self.record: float | None = None  # newest value of the register of past faults
         self.trip: _Trip | None = None
-        self.cells = _rows_of(polled.polls, cycle_s, since_ns)
+        self.cells = _rows_of(polled.polls, since_ns)
         # computed channels are not in `cells`, because their values do not show whether the drive answers
-        self.channels = _rows_of(polled.series[len(polled.polls) :], cycle_s, since_ns)
+        self.channels = _rows_of(polled.series[len(polled.polls) :], since_ns)
         self.frequency = next((name for name in FREQUENCIES if name in self.cells), "")
         # frequency in the last minute: pairs of time in ms and value
         self.minute: deque[tuple[int, float | None]] = deque(maxlen=MINUTE_POINTS)
+
+    def hold(self, cycle_s: float) -> None:
+        """Compute how long values stay current, on a line whose polling cycle takes `cycle_s`."""
+        of_channels = self.polled.series[len(self.polled.polls) :]
+        for cells, polls in ((self.cells, self.polled.polls), (self.channels, of_channels)):
+            for poll in polls:
+                cells[poll.register.name].holds_ns = round(current_for(max(cycle_s, poll.every or 0.0)) * 1e9)
 
 
 class Hub:
@@ -200,9 +204,9 @@ class Hub:
             for polled in line.drives:
                 known = before.get(polled.drive.name)
                 stays = known is not None and known.polled == polled
-                self._watched[polled.drive.name] = (
-                    known if known is not None and stays else _WatchedDrive(polled, cycle_s, since_ns)
-                )
+                watched = known if known is not None and stays else _WatchedDrive(polled, since_ns)
+                watched.hold(cycle_s)
+                self._watched[polled.drive.name] = watched
         for (drive, name), seconds in ChannelSet(series_of(plant, planned)).holds_s.items():
             cell = self._watched[drive].channels[name]
             # the channel may have an input from another drive, whose values stay current longer
