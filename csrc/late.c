@@ -287,8 +287,8 @@ int md_late_bars(const struct md_exchange *exchange, int64_t now_ns)
     return !md_proof_is(exchange) && has_mistakable(exchange, 0);
 }
 
-/* The last proof is held back while the drive is silent, and sent once the drive answers again. It was not
- * sent during the silence. So at the latest the second reply to it settles all outstanding requests. */
+/* Return the proof that is not sent while the drive is silent, only once it answers again. As it was not sent
+ * during the silence, at the latest the second reply to it settles all outstanding requests. */
 static const struct md_exchange *last_proof(const struct md_drive *drive)
 {
     return drive->proof_count ? drive->proofs[drive->proof_count - 1] : NULL;

@@ -69,7 +69,7 @@ static void learn_echo(struct md_line *line, size_t reply_at)
     int shown = is_copy && line->echo == MD_NO_ECHO ? MD_ECHO_UNKNOWN : MD_ECHO;
     uint32_t most_stray = line->echo == MD_ECHO_UNKNOWN ? (line->tx_len - 1U) / 2 : 0;
     if (line->completion->skipped - line->cut <= most_stray && !is_copy)
-        learn(line, line->echo == MD_ECHO ? MD_ECHO_UNKNOWN : MD_NO_ECHO); /* an echo may have been lost */
+        learn(line, line->echo == MD_ECHO ? MD_ECHO_UNKNOWN : MD_NO_ECHO); /* the echo may have been lost */
     for (size_t at = 0; at + line->tx_len <= reply_at && !md_late_is_repeated(line->exchange); at++)
         if (md_echo_is_copy(line, at))
             learn(line, shown);

@@ -30,10 +30,10 @@ _log = logging.getLogger("multidrop.bus")
 
 
 def made(drive: D | type[D], address: int | None, line: dict[str, Any], details: dict[str, Any]) -> D:
-    """Return `drive`, or, if it is a family, a new drive of that family.
+    """Return `drive`; if it is a class, create a drive of that class.
 
     `line` and `details` are options of the new drive; `details` override `line`. Raises TypeError if `drive`
-    is neither a class of drives nor a drive, if the address is missing, or if details are given for an
+    is neither a drive nor a class of drives, if the address is missing, or if details are given for an
     existing drive.
     """
     family = drive if isinstance(drive, type) else type(drive)

@@ -61,7 +61,7 @@ class EchoCheck:
                 self._exchanges.values(drive, [register], attempts, insists=insists, timeout=timeout)
 
     def probe(self, drive: Drive, *, insists: bool = False) -> None:
-        """Read a register once, so that the line learns whether a received copy of a request was an echo.
+        """Read a register once, to learn whether the adapter echoes requests.
 
         A request that another client sends may look like our echo. Without this read, later confirmations of
         writes, which are copies of their requests, would be ignored as echoes.

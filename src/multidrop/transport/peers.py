@@ -93,8 +93,8 @@ class Peers:
         # never replaced: the core may still read the known peer's list of proofs
         if key not in self._known:
             self._known[key] = self._new(drive, least)
-        # otherwise a late reply of a removed drive could be taken for the new drive's reply
         peer = self.present[drive] = self._known[key]
+        # a late reply of an earlier drive at this address must not be taken for a reply of this drive
         for other, known in self._known.items():
             if other[0] == drive.address and known is not peer:
                 self._line.inherit(peer, known)
