@@ -16,7 +16,7 @@ enum {
     MD_MOST_FRAME = 513,      /* longest frame: of Modbus ASCII, ':', 2 * 255 hex digits, CR, LF */
     MD_MOST_TCP = 260,        /* longest frame of Modbus TCP */
     MD_KEPT_FRAME = 24,       /* longest frame that an exchange stores; every read fits */
-    MD_STATUSES = 23,         /* all row statuses are below this number, except those from MD_EXCEPTION on */
+    MD_STATUSES = 23,         /* number of row statuses, not counting those from MD_EXCEPTION on */
     MD_EXCEPTION_CODES = 256,
     MD_DELAY_BUCKETS = 128,
     MD_MOST_OWED = 12,        /* limit of the outstanding requests of a drive */
@@ -118,7 +118,7 @@ int64_t md_utc_minus_monotonic_ns(void);
 /* Counters of a drive's exchanges; all except longest_ns only grow. `values`: number of values read. */
 struct md_counters {
     uint64_t exchanges, answered, values;
-    uint64_t sent;        /* requests of which at least one byte was sent */
+    uint64_t sent;        /* requests that were sent, at least in part */
     uint64_t stray_bytes; /* bytes outside of replies */
     uint64_t ideal_ns;    /* sum of the shortest possible line times of the answered exchanges */
     int64_t longest_ns;   /* longest response delay */

@@ -251,7 +251,7 @@ def _decoded(data: bytes, coding: Coding, count: int) -> Iterator[float | None]:
 
 
 def _objects_of(data: bytes) -> dict[int, bytes]:
-    """Return objects' contents by their number; `data` has the number, length and content of each object."""
+    """Return the content of each object by its number. `data` has number, length and content of each."""
     found: dict[int, bytes] = {}
     at = 0
     while at < len(data):

@@ -14,7 +14,7 @@ Lines = Mapping[tuple[Steps, str], int]
 
 
 def line_numbers(path: Path) -> Lines:
-    """Return the line numbers of a TOML file's keys, by their table's path and their name.
+    """Return the line numbers of a TOML file's keys, by table path and key name.
 
     The name "" stands for a table's header or an element of a list. A file that cannot be read has none.
     """

@@ -89,7 +89,7 @@ class StopAttempt:
         # SystemExit or similar, raised by the script; kept until all stops are over
         self.interruption: BaseException | None = None
         self.frame: Message | None = None  # the newest request of this stop
-        self._times_in_doubt = 0  # number of frames of which it is unknown whether they were sent
+        self._times_in_doubt = 0  # number of frames that may or may not have been sent
         self._is_confirmed = False
         self._pulses: set[tuple[str, Any]] = set()
         self._has_warned = False

@@ -105,7 +105,7 @@ class Counters(NamedTuple):
     exchanges: int = 0
     answered: int = 0
     values: int = 0
-    sent: int = 0  # number of requests of which at least one byte was sent
+    sent: int = 0  # number of requests that were sent, at least in part
     exceptions: int = 0  # exchanges that ended with an exception
     naks: int = 0  # exceptions with code 07
     busies: int = 0  # exceptions with code 06
