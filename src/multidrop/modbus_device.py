@@ -190,8 +190,8 @@ class ModbusDevice(Drive):
             raise ValueError(f"one write takes 1 to {most} registers or coils, not {count}")
         if confirm is not True:
             raise WriteForbidden(
-                f"{what} of {self.name} is not written: this device is unknown, and a write may start a "
-                f"motor. If it cannot, {_CONFIRM}",
+                f"nothing is written to {what} of {self.name}: this device is unknown, and a write may start "
+                f"a motor. If it cannot, {_CONFIRM}",
                 rule="an unknown device is not written to",
                 advice=Advice(_CONFIRM, "declare its family"),
             )

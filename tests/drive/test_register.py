@@ -503,3 +503,8 @@ def test_declared_title_takes_precedence_over_catalogue_and_english_titles() -> 
 )
 def test_first_language_that_has_titles_is_chosen(tags: list[str], language: str) -> None:
     assert chosen_language(tags) == language
+
+
+def test_a_unit_and_an_enumeration_may_be_keywords() -> None:
+    assert reading(0x10, unit="kW").unit == "kW"
+    assert reading(0x10, values=IntEnum("Mode", "SLOW")).values is not None

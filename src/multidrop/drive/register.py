@@ -467,9 +467,9 @@ class Declaration(Protocol):
     """A function that declares a register: it takes the address, the unit or enumeration, and `Details`."""
 
     @overload
-    def __call__(self, address: int, unit: str = "", /, **details: Unpack[Details]) -> Register[float]: ...
+    def __call__(self, address: int, unit: str = "", **details: Unpack[Details]) -> Register[float]: ...
     @overload
-    def __call__(self, address: int, values: type[E], /, **details: Unpack[Details]) -> Register[E]: ...
+    def __call__(self, address: int, values: type[E], **details: Unpack[Details]) -> Register[E]: ...
 
 
 def declaration(declare: Callable[..., Register[Any]]) -> Declaration:
@@ -499,9 +499,8 @@ def _declare(access: Access, address: int, what: Any, given: Details) -> Registe
     details = cast(Any, given)
     if isinstance(details.get("invalid"), (int, float)):
         details = {**details, "invalid": (details["invalid"],)}
-    if isinstance(what, str):
-        return Register(address, access, unit=what, **details)
-    return Register(address, access, values=what, **details)
+    key = "unit" if isinstance(what, str) else "values"
+    return Register(address, access, **{key: what, **details})
 
 
 def row_field(register: Register[Any], at: int, code: int) -> Field:
