@@ -14,6 +14,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import product
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from urllib.parse import parse_qs, unquote
 
@@ -27,7 +28,7 @@ from tables import table
 from multidrop.gateway.commands import VERBS
 from multidrop.gateway.http import files
 from multidrop.gateway.http.files import MOST_EXPORTS, Exports
-from multidrop.gateway.http.messages import language_of
+from multidrop.gateway.http.messages import Denied, language_of
 from multidrop.gateway.http.operations import OPERATIONS, openapi
 from multidrop.gateway.http.rights import COMMAND_ID, May, Right
 
@@ -303,6 +304,13 @@ def test_file_name_of_an_export_has_the_drive_and_the_time_range(asked: str, nam
     assert unquote(whole) == f"{name}.csv"
     assert plain.isascii()
     assert plain.count('"') == 2
+
+
+async def test_an_export_whose_name_is_invalid_does_not_count_as_under_way() -> None:
+    exports, part = Exports(), SimpleNamespace(export=lambda *asked: iter([b""]))
+    with pytest.raises(Denied):
+        await exports.respond(part, ["\ud800.y"], 0, 1, "csv")
+    assert exports.under_way == 0
 
 
 # ---- the page's files over HTTP: types, ETags, and paths outside the page's folder ----

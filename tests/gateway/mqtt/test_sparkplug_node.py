@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 from batches import add_rows, new_completion
@@ -386,6 +387,11 @@ def test_a_failed_start_of_the_mqtt_part_leaves_no_spool_open(tmp_path: Path) ->
     for _ in range(2):
         with pytest.raises(ValueError, match="sparkplug is not a spool"):
             build(settings, inside(tmp_path))
+    full = RuntimeError("can't start new thread")
+    with patch("multidrop.gateway.mqtt.rows.sparkplug_rows", side_effect=full):
+        for _ in range(2):
+            with pytest.raises(RuntimeError, match="can't start new thread"):
+                build(settings, inside(tmp_path))
 
 
 @pytest.mark.slow

@@ -146,18 +146,18 @@ class Exports:
             raise Denied(503, f"{MOST_EXPORTS} exports are under way: try again when one has ended")
         self.under_way += 1
         try:
+            name = f"{_what(names)} {_moment(begin)} to {_moment(end)}.{kind}"
+            headers = attachment(name) | {"vary": "accept-encoding"}
             pieces = await _in_thread(partial(part.export, names, begin, end, kind))
+            if is_gzipped:
+                pieces = _gzipped(pieces)
+                headers["content-encoding"] = "gzip"
+            return _Export(self, pieces, kind, headers)
         except BaseException as failure:
             self.under_way -= 1
             if isinstance(failure, ValueError):
                 raise Denied(400, str(failure)) from failure
             raise
-        name = f"{_what(names)} {_moment(begin)} to {_moment(end)}.{kind}"
-        headers = attachment(name) | {"vary": "accept-encoding"}
-        if is_gzipped:
-            pieces = _gzipped(pieces)
-            headers["content-encoding"] = "gzip"
-        return _Export(self, pieces, kind, headers)
 
 
 class _Export(StreamingResponse):

@@ -70,7 +70,7 @@ class Mqtt:
         try:
             for broker, node in zip(self._brokers[1:], self._speakers[1:], strict=True):
                 self._forwarded.append(sparkplug_rows(settings, context, broker, node))
-        except ValueError:
+        except BaseException:
             for one in self._forwarded:
                 one.abandon()
             raise
