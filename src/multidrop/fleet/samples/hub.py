@@ -33,7 +33,7 @@ _log = logging.getLogger("multidrop.fleet.samples.hub")
 class SourceCheck:
     """Checks that no message of a gateway's log is missing or repeated.
 
-    Alarms are logged as errors and counted.
+    Alarms are logged as errors and counted, each once, even if messages are read again after a failure.
     """
 
     def __init__(self, last: Mapping[str, int]) -> None:
@@ -43,25 +43,45 @@ class SourceCheck:
         self.doubled = 0  # number of repeated messages, which are ignored
         # number of lost rows that the spool has reported, by gateway and id of its log
         self._lost: dict[str, int] = {}
+        # sequence number of the last message counted as missing, by gateway and id of its log
+        self._missed: dict[str, int] = {}
+        self._newest = 0  # stream position of the newest message
+        self._known = 0  # stream position up to which errors were counted before the last `restart`
+
+    def restart(self, last: Mapping[str, int]) -> None:
+        """Check again the messages after these sequence numbers."""
+        self.last, self._known = dict(last), self._newest
 
     def take(self, message: StreamMessage) -> bool:
         """Return True if the message is new and must be stored."""
         name = f"{message.gateway}.{message.log}"
+        self._newest = max(self._newest, message.place)
         if message.sequence == 0:
-            self.alarm(f"message {message.place} of the stream, by {name}, has no number and is ignored")
+            self.reject(
+                message, f"message {message.place} of the stream, by {name}, has no number and is ignored"
+            )
             return False
         before = self.last.get(name, 0)
         if message.sequence <= before:
-            self.doubled += 1
-            self.alarm(f"{name}: message {message.sequence} came again after {before} and is ignored")
+            sentence = f"{name}: message {message.sequence} came again after {before} and is ignored"
+            self.doubled += self.reject(message, sentence)
             return False
-        if message.sequence > before + 1:
-            self.missing += message.sequence - before - 1
-            self.alarm(f"{name}: messages {before + 1} to {message.sequence - 1} are missing")
-        if message.lost > self._lost.get(name, 0):
+        first = max(before, self._missed.get(name, 0)) + 1
+        if message.sequence > first:
+            self.missing += message.sequence - first
+            self._missed[name] = message.sequence - 1
+            self.alarm(f"{name}: messages {first} to {message.sequence - 1} are missing")
+        if message.place > self._known and message.lost > self._lost.get(name, 0):
             self.alarm(f"{name}: its spool has lost {message.lost} rows since its start")
         self._lost[name] = message.lost
         self.last[name] = message.sequence
+        return True
+
+    def reject(self, message: StreamMessage, sentence: str) -> bool:
+        """Log and count that a message is ignored; return False if it was counted before."""
+        if message.place <= self._known:
+            return False
+        self.alarm(sentence)
         return True
 
     def alarm(self, sentence: str) -> None:
@@ -136,6 +156,7 @@ class SampleHub:
         self._path, self._sink, self._every = path, sink, every
         self._sources = SourceCheck({})
         self._place = self._end = self._rows = 0
+        self._removed = 0  # the last message of the stream that was removed before it was stored
         self._trouble: str | None = None
 
     def state(self) -> HubState:
@@ -171,10 +192,12 @@ class SampleHub:
         self._stream, self._place = found.created, kept.place
         # if `first` is above `last`, the stream is empty now
         self._end = found.last if found.first <= found.last else kept.place
-        self._sources.last = dict(kept.sources)
+        self._sources.restart(kept.sources)
         self._check_end(found)
-        if found.first > kept.place + 1 and found.last > kept.place:
-            gone = f"messages {kept.place + 1} to {found.first - 1}"
+        first = max(kept.place, self._removed) + 1
+        if found.first > first and found.last > kept.place:
+            self._removed = found.first - 1
+            gone = f"messages {first} to {self._removed}"
             self._sources.alarm(f"{gone} of the stream were removed before they were read")
 
     def _check_end(self, found: StreamInfo) -> None:
@@ -229,7 +252,7 @@ class SampleHub:
                     found.append(unpack(message.data))
                 except MessageError as error:
                     name = f"{message.gateway}.{message.log}"
-                    self._sources.alarm(f"{name}: message {message.sequence} is ignored: {error}")
+                    self._sources.reject(message, f"{name}: message {message.sequence} is ignored: {error}")
         return found
 
     def _note(self, trouble: str | None) -> None:
