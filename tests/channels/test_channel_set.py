@@ -258,3 +258,37 @@ def test_invalid_name_of_a_computed_channel_is_reported(name: str, sentence: str
     )
     assert [mistake.sentence for mistake in made.mistakes] == [sentence]
     assert not made
+
+
+def awake(one: SlotRow, slept_s: float) -> SlotRow:
+    """Return a row from after a sleep of the computer, in which the monotonic clock stood still."""
+    return one._replace(time_ns=one.time_ns + round(slept_s * S))
+
+
+@pytest.mark.parametrize("batches", [1, 2])
+def test_a_sleep_of_the_computer_is_an_outage(batches: int) -> None:
+    """It sleeps for an hour at 1.25 s. One batch has all rows, or the sleep is between two batches."""
+    change, total = Channel("change", "derivative(power)", "kW/s"), Channel("both", "power + other", "kW")
+    made = channels(ENERGY, change, total, power="kW", other="kW")
+    before = [row(1, 0.0, 1.0), row(0, 0.0, 3600.0), row(0, 1.0, 3600.0)]
+    after = [awake(row(0, at, 7200.0), 3600) for at in (1.5, 2.0)] + [awake(row(1, 2.0, 2.0), 3600)]
+    found = made.compute(before[:2], 50 * S)
+    found += made.compute(before[2:] + (after if batches == 1 else []), 3650 * S)
+    found += made.compute(after if batches == 2 else [], 3650 * S)
+    energy, changes, sums = ([one for one in found if one.slot == slot] for slot in (2, 3, 4))
+    assert [one.value for one in energy if one.status == 0] == [0.0, 1.0, 1.0, 2.0]
+    assert list(map(str, made.outages)) == ["pump.energy: 3600 s without values are not counted"]
+    # the first value after the sleep has no derivative
+    assert [(one.monotonic_ns / S, one.value) for one in changes if one.status == 0] == [
+        (1.0, 0.0),
+        (2.0, 0.0),
+    ]
+    # the other register was read too long ago until it is read again
+    assert [(one.status, one.value) for one in sums][-2:] == [(OLD, 0.0), (0, 7202.0)]
+
+
+def test_a_clock_change_is_no_outage() -> None:
+    made = channels(ENERGY, power="kW")
+    made.compute([row(0, 0.0, 3600.0)], 50 * S)
+    assert last_value(made, [awake(row(0, 1.0, 3600.0), 3600)]) == 1.0
+    assert made.outages == []

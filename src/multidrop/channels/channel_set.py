@@ -16,6 +16,8 @@ MOST_CHANNELS = 1000  # limit of channels in a plant
 MOST_NAME = 100  # limit of characters in a channel's name, and in its unit
 UNSEEN = -1  # status of a register or channel that has had no row yet
 OLD = -2  # status of a register or channel whose newest value is too old
+# in ns: a smaller increase of the computer's time asleep is ignored, because it is inexact
+LEAST_SLEEP_NS = 100_000_000
 
 
 class Mistake(NamedTuple):
@@ -97,6 +99,8 @@ class ChannelSet:
         self._newest_ns: dict[int, int] = {}
         # periods without values that have ended; the caller empties this list
         self.outages: list[Outage] = []
+        self._slept_ns = 0  # how long the computer has slept, at the latest call of `compute`
+        self._ahead_ns: int | None = None  # UTC minus monotonic time of the newest row
 
     def _add(self, drive: DriveSeries, channel: Channel, series: SeriesTable) -> None:
         try:
@@ -134,13 +138,28 @@ class ChannelSet:
 
     # ---- rows ----
 
-    def compute(self, rows: Iterable[SlotRow]) -> list[SlotRow]:
+    def compute(self, rows: Iterable[SlotRow], slept_ns: int = 0) -> list[SlotRow]:
         """Return the rows of channels that are computed from these rows of registers.
 
-        A channel gets a row for each request that read one of its registers, with the time of that request.
+        `slept_ns` is how long the computer has slept since its boot: the monotonic clock stops meanwhile. A
+        channel gets a row for each request that read one of its registers, with the time of that request.
         If the newest row of a register has no value, the channel's row has none either, and the same status.
         If a register has had no row for too long, the channel's row has no value and the status OLD.
         """
+        if self._ahead_ns is None:
+            self._slept_ns = slept_ns
+        step_ns = slept_ns - self._slept_ns
+        if self._ahead_ns is None or step_ns <= LEAST_SLEEP_NS:
+            return self._compute(rows)
+        self._slept_ns = slept_ns
+        listed, awake_ns = [*rows], self._ahead_ns + step_ns // 2
+        found = self._compute(row for row in listed if row.time_ns - row.monotonic_ns < awake_ns)
+        self._known_ns = {slot: known_ns - step_ns for slot, known_ns in self._known_ns.items()}
+        for computed in self._computed:
+            computed.program.note_sleep(step_ns)
+        return found + self._compute(row for row in listed if row.time_ns - row.monotonic_ns >= awake_ns)
+
+    def _compute(self, rows: Iterable[SlotRow]) -> list[SlotRow]:
         found: list[SlotRow] = []
         group: dict[int, SlotRow] = {}  # rows of one request, by index of the register
         key: tuple[int, str] | None = None
@@ -161,6 +180,7 @@ class ChannelSet:
         for row in group:
             self._note(row, fresh)
         first = group[0]
+        self._ahead_ns = first.time_ns - first.monotonic_ns
         for computed in self._computed:
             program = computed.program
             if program.slots.isdisjoint(fresh):
@@ -245,6 +265,7 @@ class ChannelSet:
         `before` is an earlier set. `replaced` are names that now belong to other drives. Totals do not count
         the time between the last value of the old drive and the first value of the new one.
         """
+        self._slept_ns, self._ahead_ns = before._slept_ns, before._ahead_ns
         known = {(one.name, one.channel, *one.program.units): one for one in before._computed}
         for one in self._computed:
             if same := known.get((one.name, one.channel, *one.program.units)):

@@ -229,6 +229,10 @@ class StatefulFunction:
                 self._step(value, step_ns / 1e9)
         self._last_ns, self._last, self.is_interrupted = now_ns, value, False
 
+    def note_sleep(self, slept_ns: int) -> None:
+        if self._last_ns is not None:
+            self._last_ns -= slept_ns
+
     def take_over(self, before: StatefulFunction) -> None:
         """Continue with the memory of the same function in an earlier program of the channel."""
         vars(self).update(vars(before) | {"hold_ns": self.hold_ns})

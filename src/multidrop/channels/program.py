@@ -262,6 +262,11 @@ class Program:
             if isinstance(step, _Memorised) and not step.slots.isdisjoint(slots):
                 step.memory.is_interrupted = True
 
+    def note_sleep(self, slept_ns: int) -> None:
+        """Count the time that the computer slept since the newest values of the functions with a memory."""
+        for memory in self.memories:
+            memory.note_sleep(slept_ns)
+
     def run(self, values: Sequence[Value], fresh: Collection[int], now_ns: int) -> Value:
         """Return the value in the declared unit, computed from the newest values of registers and channels.
 

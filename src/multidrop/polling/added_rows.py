@@ -165,6 +165,8 @@ class AddedRows:
         return Batch(JoinedColumns(columns, added), self._names.drives, self._names.registers)
 
     def _computed(self, batch: Batch) -> list[AddedRow]:
+        # boot time is read first: a pause between the two reads cannot make the difference too large
+        slept_ns = clock.boottime_ns() - clock.now_ns()
         added = [
             AddedRow(
                 row.time_ns,
@@ -174,7 +176,7 @@ class AddedRows:
                 INPUT_OLD if row.status == OLD else row.status,
                 row.value,
             )
-            for row in self._channels.compute(self._rows_of_present_drives(batch))
+            for row in self._channels.compute(self._rows_of_present_drives(batch), slept_ns)
         ]
         outages, self._channels.outages = self._channels.outages, []
         for number, outage in enumerate(outages):
