@@ -191,10 +191,10 @@ class IdentityCheck:
             if make is not None:
                 why = f"nothing is written to {drive.name}: {_declare(make)}"
                 raise WriteForbidden(why, rule="it shows another make")
-            missing = peer.silences - before
-            if not missing:
+            if peer.silences == before:
                 break
-            silences += missing
+            silences += peer.silences - before
+        else:
             with timed():
                 self._echo.read_any(drive, READ_ATTEMPTS)
         return silences
