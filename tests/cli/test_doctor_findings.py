@@ -73,16 +73,12 @@ def sysfs(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_an_adapter_is_found_through_sysfs(sysfs: Path) -> None:
-    adapter = find_adapter("/dev/ttyUSB0", sysfs)
+@pytest.mark.parametrize("is_link", [False, True])
+def test_an_adapter_is_found_through_sysfs(sysfs: Path, is_link: bool) -> None:
+    (sysfs / "by-id").symlink_to("/dev/ttyUSB0")
+    adapter = find_adapter(str(sysfs / "by-id") if is_link else "/dev/ttyUSB0", sysfs)
     assert (adapter.name, adapter.driver, adapter.product) == ("ttyUSB0", "ftdi_sio", "FTDI FT232R USB UART")
     assert (adapter.usb_id, adapter.latency_timer) == ("0403:6001", 16)
-
-
-def test_a_link_to_a_device_finds_the_devices_adapter(sysfs: Path) -> None:
-    link = sysfs / "by-id"
-    link.symlink_to("/dev/ttyUSB0")
-    assert find_adapter(str(link), sysfs).driver == "ftdi_sio"
 
 
 def test_an_adapter_without_known_facts_has_only_a_name(sysfs: Path) -> None:

@@ -48,29 +48,23 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
 @pytest.fixture(scope="module")
 def fleet(nats: Cluster) -> Cluster:
     """Return three servers after `fleet init`."""
-    asyncio.run(_init(nats))
+    from nats_clusters import initialised
+
+    asyncio.run(initialised(nats.urls))
     return nats
 
 
 @pytest.fixture(scope="module")
 def one(running: Cluster) -> Cluster:
     """Return one server after `fleet init`."""
-    asyncio.run(_init(running))
+    from nats_clusters import initialised
+
+    asyncio.run(initialised(running.urls))
     return running
 
 
-async def _init(servers: Cluster) -> None:
-    from multidrop.fleet.servers.connections import paths_of
-    from multidrop.fleet.servers.setup import set_up
-
-    paths = paths_of(servers.urls)
-    await set_up(paths)
-    for path in paths:
-        await path.close()
-
-
 @pytest.fixture
-def desk(tmp_path: Path) -> Iterator[Desks]:
+def desk(tmp_path: Path, _patient: None) -> Iterator[Desks]:
     """Return the command desk and stop desk of a gateway with a simulated drive."""
     from fleets import desks
 

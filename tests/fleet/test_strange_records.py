@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from fleets import Hall, RecordingMastership
 from nats.aio.msg import Msg
-from nats_clusters import Cluster, connected_path
+from nats_clusters import Cluster, connected_path, opened_paths
 from tables import table
 
 from multidrop.fleet.errors import FleetError, OutcomeUnknown
@@ -128,9 +128,7 @@ async def test_a_gateway_survives_invalid_records(one: Cluster, monkeypatch: pyt
                 key = f"gw-{number}.rogue" if bucket in names.LEASES else f"line-{number}"
                 await path.request(f"$KV.{bucket}.{key}{suffix}", data[:SMALL])
 
-    async with connected_path(one) as path:
-        paths = paths_of(one.urls)
-        await open_all(paths)
+    async with connected_path(one) as path, opened_paths(one.urls) as paths:
         await strew(path, "-before")
         await store(Bucket(names.PLANT, lambda: path), {"line-1": LINE})
         mastership = RecordingMastership(boottime_ns)
@@ -153,8 +151,6 @@ async def test_a_gateway_survives_invalid_records(one: Cluster, monkeypatch: pyt
         await until_polled(is_first=False)
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
-        for other in paths:
-            await other.close()
 
 
 @pytest.mark.long

@@ -16,6 +16,7 @@ from typing import Any, BinaryIO, NoReturn
 
 import pytest
 from gateways import Served, served, serving, simulated_plant
+from kills import BoundProcess
 from lines import PATIENCE, until
 
 from multidrop import History
@@ -304,16 +305,14 @@ def test_sigterm_ends_a_gateway_although_a_thread_never_ends(tmp_path: Path) -> 
     """Python would wait for the thread, such as one of a library, and not exit by itself."""
     script = tmp_path / "hangs.py"
     script.write_text(HANGING)
-    with simulated_plant(tmp_path, SERVE) as path:
-        process = subprocess.Popen([sys.executable, script, path], stdout=subprocess.PIPE, text=True)
-        try:
-            assert process.stdout is not None
-            assert process.stdout.readline().startswith("ready ")
-            process.terminate()
-            assert process.wait(PATIENCE) == 1
-        finally:
-            process.kill()
-            process.communicate()
+    with (
+        simulated_plant(tmp_path, SERVE) as path,
+        BoundProcess([sys.executable, script, path], stdout=subprocess.PIPE, text=True) as process,
+    ):
+        assert process.stdout is not None
+        assert process.stdout.readline().startswith("ready ")
+        process.terminate()
+        assert process.wait(PATIENCE) == 1
 
 
 # ---- a full disk on its own file system: polling and stops continue, and /health reports the disk ----

@@ -18,6 +18,7 @@ import pytest
 import yaml
 from free_ports import free_port
 from gateways import Served, served, serving
+from kills import BoundProcess
 from lines import PATIENCE, until
 from peers import require_program
 
@@ -64,14 +65,12 @@ def scraping(folder: Path, jobs: str) -> Iterator[Prometheus]:
         *(program, f"--config.file={folder}/prometheus.yml", f"--storage.tsdb.path={folder}/tsdb"),
         *(f"--web.listen-address=127.0.0.1:{port}", "--log.level=error"),
     ]
-    with (folder / "prometheus.log").open("w") as log, subprocess.Popen(command, stderr=log) as process:
-        try:
-            found = Prometheus(port)
-            until(lambda: process.poll() is not None or found.is_there())
-            assert process.poll() is None, (folder / "prometheus.log").read_text()
-            yield found
-        finally:
-            process.kill()
+    with (folder / "prometheus.log").open("w") as log, BoundProcess(command, stderr=log) as process:
+        found = Prometheus(port)
+        until(lambda: process.poll() is not None or found.is_there())
+        assert process.poll() is None, (folder / "prometheus.log").read_text()
+        yield found
+        process.kill()
 
 
 try:

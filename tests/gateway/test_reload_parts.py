@@ -6,6 +6,7 @@ import asyncio
 import socket
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -174,23 +175,19 @@ def test_reloads_start_and_change_and_end_the_history(gateway: Served, tmp_path:
 @pytest.mark.slow
 def test_reloads_start_and_change_and_end_mqtt(gateway: Served, tmp_path: Path) -> None:
     require_module("paho.mqtt.client")
-    with mosquitto(tmp_path) as broker:
-        heard = Listener(broker)
+    with mosquitto(tmp_path) as broker, closing(Listener(broker)) as heard:
 
         def says(topic: str, payload: bytes) -> None:
             heard.wait_for(lambda one: (one.topic, one.payload) == (topic, payload))
 
-        try:
-            table = f'[serve.mqtt]\nbroker = "{broker.address}"\nprefix = '
-            assert reload(gateway, table + '"old"\n') == IN_EFFECT
-            says("old/gateway", b"online")
-            assert reload(gateway, table + '"new"\n') == IN_EFFECT
-            says("old/gateway", b"offline")
-            says("new/gateway", b"online")
-            assert reload(gateway, "") == IN_EFFECT
-            says("new/gateway", b"offline")
-        finally:
-            heard.close()
+        table = f'[serve.mqtt]\nbroker = "{broker.address}"\nprefix = '
+        assert reload(gateway, table + '"old"\n') == IN_EFFECT
+        says("old/gateway", b"online")
+        assert reload(gateway, table + '"new"\n') == IN_EFFECT
+        says("old/gateway", b"offline")
+        says("new/gateway", b"online")
+        assert reload(gateway, "") == IN_EFFECT
+        says("new/gateway", b"offline")
 
 
 # ---- stops during a reload that moves drives' names from one line to another ----

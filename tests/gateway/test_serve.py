@@ -147,25 +147,22 @@ def test_a_stop_does_not_wait_until_the_log_is_read(tmp_path: Path) -> None:
         with (
             os.fdopen(unread),
             os.fdopen(log, "wb"),
-            subprocess.Popen(words, stdout=subprocess.PIPE, stderr=log, text=True) as process,
+            BoundProcess(words, stdout=subprocess.PIPE, stderr=log, text=True) as process,
         ):
-            try:
-                assert process.stdout is not None
-                port = int(process.stdout.readline().rstrip("/\n").rpartition(":")[2])
-                os.set_blocking(log, False)  # so that the test can fill the pipe without hanging
-                with suppress(BlockingIOError):
-                    while True:
-                        os.write(log, bytes(1))
-                os.set_blocking(log, True)
-                connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE)
-                with closing(connection):
-                    connection.request("POST", "/api/stop", "{}", {"content-type": "application/json"})
-                    found = json.loads(connection.getresponse().read())
-                assert [one["done"] for one in found.values()] == [True, True]
-                process.send_signal(signal.SIGTERM)
-                assert process.wait(PATIENCE) == 0
-            finally:
-                process.kill()
+            assert process.stdout is not None
+            port = int(process.stdout.readline().rstrip("/\n").rpartition(":")[2])
+            os.set_blocking(log, False)  # so that the test can fill the pipe without hanging
+            with suppress(BlockingIOError):
+                while True:
+                    os.write(log, bytes(1))
+            os.set_blocking(log, True)
+            connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE)
+            with closing(connection):
+                connection.request("POST", "/api/stop", "{}", {"content-type": "application/json"})
+                found = json.loads(connection.getresponse().read())
+            assert [one["done"] for one in found.values()] == [True, True]
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(PATIENCE) == 0
 
 
 @pytest.mark.long
@@ -273,23 +270,20 @@ def test_a_demo_of_the_page_warns_about_ignored_options(run: Run, monkeypatch: p
 @pytest.mark.parametrize("words", [["demo", "--web"], ["serve", "--demo"]])
 def test_a_demo_of_the_web_page_is_live_and_local_users_may_stop_it(words: list[str]) -> None:
     with BoundProcess([*MULTIDROP, *words, "--no-browser"], stdout=subprocess.PIPE, text=True) as process:
-        try:
-            assert process.stdout is not None
-            port = int(process.stdout.readline().strip().rstrip("/").rpartition(":")[2])
+        assert process.stdout is not None
+        port = int(process.stdout.readline().strip().rstrip("/").rpartition(":")[2])
 
-            def read(path: str) -> dict[str, Any]:
-                with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE)) as connection:
-                    found: dict[str, Any] = json.loads(get(connection, path))
-                    return found
+        def read(path: str) -> dict[str, Any]:
+            with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE)) as connection:
+                found: dict[str, Any] = json.loads(get(connection, path))
+                return found
 
-            plant = read("/api/plant")
-            assert plant["demo"] is True
-            assert plant["may"]["role"] == "write"
-            until(lambda: all(one["seen"] is not None for one in dict(read("/api/frame")["drives"]).values()))
-            process.send_signal(signal.SIGINT)
-            assert process.wait(PATIENCE) == 0
-        finally:
-            process.kill()
+        plant = read("/api/plant")
+        assert plant["demo"] is True
+        assert plant["may"]["role"] == "write"
+        until(lambda: all(one["seen"] is not None for one in dict(read("/api/frame")["drives"]).values()))
+        process.send_signal(signal.SIGINT)
+        assert process.wait(PATIENCE) == 0
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed")

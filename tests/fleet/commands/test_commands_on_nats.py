@@ -15,7 +15,7 @@ from fleets import LINE, MAY, Desks, desks
 from nats.aio.client import Client
 from nats.errors import NoRespondersError
 from nats.errors import TimeoutError as NatsTimeout
-from nats_clusters import Cluster
+from nats_clusters import Cluster, close_all, initialised, opened_paths
 from secured_clusters import GATEWAYS, SecuredCluster, secured_cluster
 
 from multidrop.control import CommandOutcome
@@ -28,7 +28,7 @@ from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import Bucket
 from multidrop.fleet.servers.connections import ServerPath, connect, paths_of
 from multidrop.fleet.servers.plant_store import store
-from multidrop.fleet.servers.setup import open_all, set_up
+from multidrop.fleet.servers.setup import open_all
 from multidrop.supervisor import supervisor
 
 pytestmark = [pytest.mark.slow, pytest.mark.long]
@@ -66,8 +66,7 @@ class OnNats:
             await path._client.flush()
 
     async def die(self) -> None:
-        for path in self.paths:
-            await path.close()
+        await close_all(self.paths)
 
 
 class Fleet:
@@ -334,21 +333,16 @@ def servers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SecuredCluster
 @asynccontextmanager
 async def commanded(servers: SecuredCluster, made: Desks) -> AsyncIterator[CommandSubjects]:
     """Let one gateway subscribe to commands with only the rights of a gateway."""
-    operator = paths_of(servers.urls, servers.options("operator"))
-    await set_up(operator)
-    await store(Bucket(names.PLANT, lambda: operator[0]), PLANT)
+    await initialised(servers.urls, **servers.options("operator"))
+    async with opened_paths(servers.urls, **servers.options("operator")) as operator:
+        await store(Bucket(names.PLANT, lambda: operator[0]), PLANT)
     gateway = GATEWAYS[0]
-    paths = paths_of(servers.urls, servers.options(gateway))
-    subjects = CommandSubjects(gateway, paths, made.lines, made.log)
-    try:
-        await open_all(paths)
+    async with opened_paths(servers.urls, **servers.options(gateway)) as paths:
+        subjects = CommandSubjects(gateway, paths, made.lines, made.log)
         await subjects.begin()
         subjects.open(LINE, PLANT[LINE])
         await asyncio.gather(*supervisor().started)
         yield subjects
-    finally:
-        for path in (*operator, *paths):
-            await path.close()
 
 
 def test_a_commander_may_command_and_a_viewer_may_not(servers: SecuredCluster, tmp_path: Path) -> None:

@@ -46,7 +46,6 @@ def setpoints(desk: Desks) -> list[int]:
     return [raw for name, raw in desk.writes if name == SETPOINT]
 
 
-@patient
 def test_a_command_is_logged_before_and_after_it_is_carried_out(desk: Desks, tmp_path: Path) -> None:
     token = desk.offered(20.0)
     assert desk.writes == []
@@ -61,7 +60,6 @@ def test_a_command_is_logged_before_and_after_it_is_carried_out(desk: Desks, tmp
     assert (frame["by"], frame["way"]) == ("anna", "fleet")
 
 
-@patient
 def test_a_duplicated_confirmation_is_carried_out_once_with_one_answer(desk: Desks) -> None:
     token = desk.offered()
 
@@ -75,14 +73,12 @@ def test_a_duplicated_confirmation_is_carried_out_once_with_one_answer(desk: Des
     assert setpoints(desk) == [2000]
 
 
-@patient
 def test_copies_of_a_command_request_get_the_same_offer(desk: Desks) -> None:
     same = {"id": "one", "register": SETPOINT, "value": 20.0}
     assert desk.offered(**same) == desk.offered(**same)
     assert desk.offered(**same) != desk.offered(**(same | {"id": "two"}))
 
 
-@patient
 @pytest.mark.parametrize(("seconds", "outcome"), [(0.5, DONE), (1.0, NOT_SENT), (60.0, NOT_SENT)])
 def test_a_late_confirmation_sends_nothing(desk: Desks, seconds: float, outcome: CommandOutcome) -> None:
     token = desk.offered()
@@ -118,7 +114,6 @@ def test_a_command_whose_thread_is_slow_is_not_sent_after_a_second(tmp_path: Pat
         assert desk.writes == []
 
 
-@patient
 def test_a_stop_cancels_a_command_until_it_is_sent(desk: Desks) -> None:
     """Right before it sends a command, the bus checks again whether a stop has cancelled the offer."""
     answer = do_after(desk, lambda: desk.desk.offers.void(LINE, ["pump"], "a stop was called"))
@@ -167,7 +162,6 @@ MEANWHILE: dict[str, Callable[[Desks], object]] = {
 }
 
 
-@patient
 @pytest.mark.parametrize("deed", MEANWHILE)
 @pytest.mark.parametrize("is_late", [False, True])
 def test_a_command_with_an_invalid_offer_is_not_sent(desk: Desks, deed: str, is_late: bool) -> None:
@@ -182,7 +176,6 @@ def test_a_command_with_an_invalid_offer_is_not_sent(desk: Desks, deed: str, is_
     assert desk.writes == []
 
 
-@patient
 def test_a_stop_of_another_drive_does_not_cancel_a_command(desk: Desks) -> None:
     token = desk.offered()
     desk.desk.offers.void(LINE, ["fan"], "a stop was called")
@@ -190,7 +183,6 @@ def test_a_stop_of_another_drive_does_not_cancel_a_command(desk: Desks) -> None:
     assert asyncio.run(desk.do(token)).outcome is DONE
 
 
-@patient
 def test_a_restarted_gateway_rejects_confirmations_of_earlier_offers(desk: Desks, tmp_path: Path) -> None:
     token = desk.offered()
     with desks(tmp_path) as after:
@@ -200,7 +192,6 @@ def test_a_restarted_gateway_rejects_confirmations_of_earlier_offers(desk: Desks
     assert desk.writes == []
 
 
-@patient
 def test_only_the_master_answers_a_command_or_a_stop(desk: Desks) -> None:
     """A gateway that does not poll the line must stay silent, because the sender uses the first answer."""
     desk.is_master = False
@@ -210,7 +201,6 @@ def test_only_the_master_answers_a_command_or_a_stop(desk: Desks) -> None:
     assert isinstance(desk.ask(register=SETPOINT, value=20.0), Offered)
 
 
-@patient
 def test_a_new_master_accepts_stops_but_no_commands_during_the_guard_time(desk: Desks) -> None:
     """During the guard time, frames of the line's previous master may still be on the line."""
     desk.is_guarded = True
@@ -219,7 +209,6 @@ def test_a_new_master_accepts_stops_but_no_commands_during_the_guard_time(desk: 
     assert desk.written == {"control"}
 
 
-@patient
 def test_a_request_for_the_result_withdraws_an_unconfirmed_offer(desk: Desks) -> None:
     token = desk.offered()
 
@@ -253,7 +242,6 @@ def test_a_damaged_permission_list_allows_nothing(tmp_path: Path, may: Any) -> N
         assert answer.outcome is REFUSED
 
 
-@patient
 @pytest.mark.slow
 def test_a_start_command_runs_the_motor_and_a_stop_stops_it(desk: Desks) -> None:
     async def main() -> list[CommandOutcome]:
@@ -266,7 +254,6 @@ def test_a_start_command_runs_the_motor_and_a_stop_stops_it(desk: Desks) -> None
     assert {"begun", "over"} == {note["step"] for note in desk.notes if note["what"] == "stop"}
 
 
-@patient
 @pytest.mark.slow
 def test_a_long_stop_reports_its_progress(desk: Desks) -> None:
     """The sender must know early that the stop was sent: a motor may take long to stop."""
@@ -293,7 +280,6 @@ LOSSES: dict[str, Callable[[Desks], object]] = {
 }
 
 
-@patient
 @pytest.mark.parametrize("loss", LOSSES)
 def test_a_stop_of_a_lost_line_has_no_answer(desk: Desks, monkeypatch: pytest.MonkeyPatch, loss: str) -> None:
     """The line's next master gets a copy of the stop, and answers it."""
@@ -312,7 +298,6 @@ def test_a_stop_of_a_lost_line_has_no_answer(desk: Desks, monkeypatch: pytest.Mo
     assert desk.written == {"control"}
 
 
-@patient
 def test_a_stop_is_sent_once_despite_copies_and_cancels_offered_commands(desk: Desks) -> None:
     token = desk.offered()
 
@@ -332,7 +317,6 @@ def full_disk(record: Any) -> None:
     raise OSError(28, "No space left on device")
 
 
-@patient
 def test_a_full_disk_blocks_commands_but_not_stops(desk: Desks) -> None:
     token = desk.offered()
     desk.log.before = full_disk
@@ -343,7 +327,6 @@ def test_a_full_disk_blocks_commands_but_not_stops(desk: Desks) -> None:
     assert asyncio.run(desk.stop()).outcome is DONE
 
 
-@patient
 @pytest.mark.slow
 def test_concurrent_writes_on_a_line_are_limited(desk: Desks) -> None:
     async def main() -> list[CommandAnswer]:
@@ -403,7 +386,6 @@ HOSTILE = [
 ]
 
 
-@patient
 @table("data", HOSTILE, ids=range(len(HOSTILE)))
 def test_invalid_commands_are_each_refused_in_one_sentence(desk: Desks, data: bytes) -> None:
     answer = desk.desk.offer(LINE, data)
@@ -451,7 +433,6 @@ ODD_STOPS = [  # stop messages that any client may send, or that a network may d
 ]
 
 
-@patient
 @pytest.mark.parametrize("data", every_third(ODD_STOPS))
 def test_a_malformed_stop_is_carried_out(
     desk: Desks,
@@ -474,7 +455,6 @@ def test_a_malformed_stop_is_carried_out(
     assert {frame["by"] for frame in read_audit(tmp_path / "audit.jsonl")} == {begun["by"]}
 
 
-@patient
 @pytest.mark.slow
 @table(
     ("first", "then"),
@@ -492,7 +472,6 @@ def test_a_stop_with_a_new_id_is_a_new_stop(desk: Desks, first: dict[str, Any], 
     assert len(desk.writes) == before + 1
 
 
-@patient
 def test_a_stop_that_names_an_unknown_drive_still_stops_the_known_drives(desk: Desks) -> None:
     answer = asyncio.run(desk.stop(drives=["pump", "fan"]))
     assert answer.outcome is REFUSED
@@ -512,14 +491,12 @@ def test_only_stops_accept_another_unicode_form_of_a_drives_name(tmp_path: Path)
         assert desk.writes == [("control", 0xC000)]
 
 
-@patient
 @table("data", [b"", b"[]", b'{"outcome": "maybe", "text": ""}', b'{"outcome": "done"}'])
 def test_a_sender_rejects_invalid_answers(data: bytes) -> None:
     with pytest.raises(ValueError, match=r"is not|must be"):
         read_answer(data) if data.startswith((b"{", b"[")) else read_offer(data)
 
 
-@patient
 def test_a_command_to_a_drive_that_has_left_its_line_is_not_sent() -> None:
     drive = InvtCHE(1, name="mill", maximum_frequency=50)
     for request in (
@@ -531,7 +508,6 @@ def test_a_command_to_a_drive_that_has_left_its_line_is_not_sent() -> None:
         assert answer.text.startswith("mill is ")
 
 
-@patient
 def test_an_offer_does_not_change_the_known_setpoint() -> None:
     """The command of an offer may never be sent. A changed setpoint would affect the next start."""
     drive = InvtCHE(1, name="mill", maximum_frequency=50)

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from controlled_loop import run_controlled
 from fleets import Hall, HandClock, MemoryBucket, RecordingMastership
-from nats_clusters import Cluster
+from nats_clusters import Cluster, close_all, opened_paths
 
 from multidrop.fleet.errors import Conflict
 from multidrop.fleet.leases import member as member_module
@@ -93,16 +93,14 @@ class Gateways:
         member._leave = _do_nothing
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
-        for path in member.paths:
-            await path.close()
+        await close_all(member.paths)
         self.hall.gateways = [lines for lines in self.hall.gateways if lines.name != name]
 
     async def leave(self, name: str) -> None:
         member, task = self.members.pop(name), self.tasks.pop(name)
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
-        for path in member.paths:
-            await path.close()
+        await close_all(member.paths)
 
     def taken(self) -> dict[str, set[str]]:
         return {name: set(member.polled) for name, member in self.members.items()}
@@ -126,10 +124,9 @@ async def _do_nothing() -> None:
 
 @asynccontextmanager
 async def gateways(cluster: Cluster, *members: str, terms: Terms = USUAL) -> AsyncIterator[Gateways]:
-    paths = paths_of(cluster.urls)
-    await open_all(paths)
-    bucket = Bucket(names.PLANT, lambda: paths[0])
-    await store(bucket, {line: {"line": {"name": line}, "files": {}} for line in LINES})
+    async with opened_paths(cluster.urls) as paths:
+        bucket = Bucket(names.PLANT, lambda: paths[0])
+        await store(bucket, {line: {"line": {"name": line}, "files": {}} for line in LINES})
     running = Gateways(cluster, terms)
     try:
         await asyncio.gather(*(running.join(name) for name in members))
@@ -138,28 +135,24 @@ async def gateways(cluster: Cluster, *members: str, terms: Terms = USUAL) -> Asy
         assert running.hall.overlaps == []
     finally:
         await asyncio.gather(*(running.leave(name) for name in list(running.members)))
-        for path in paths:
-            await path.close()
 
 
 @asynccontextmanager
 async def other_version(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Lease]:
     """Yield the lease of a gateway with an incompatible version of the ownership rules."""
-    paths = paths_of(cluster.urls)
-    await open_all(paths)
-    buckets = [
-        LeaseBucket(bucket, partial(paths.__getitem__, at), "other") for at, bucket in enumerate(names.LEASES)
-    ]
-    mastership = RecordingMastership(boottime_ns)
-    lease = Lease("other", buckets, mastership, terms=LONG, note=lambda: {"draining": False})
-    value = lease._value
-    monkeypatch.setattr(lease, "_value", lambda **ended: {**value(**ended), "rules": RULES + 1})
-    try:
-        yield lease
-    finally:
-        await lease.end()
-        for path in paths:
-            await path.close()
+    async with opened_paths(cluster.urls) as paths:
+        buckets = [
+            LeaseBucket(bucket, partial(paths.__getitem__, at), "other")
+            for at, bucket in enumerate(names.LEASES)
+        ]
+        mastership = RecordingMastership(boottime_ns)
+        lease = Lease("other", buckets, mastership, terms=LONG, note=lambda: {"draining": False})
+        value = lease._value
+        monkeypatch.setattr(lease, "_value", lambda **ended: {**value(**ended), "rules": RULES + 1})
+        try:
+            yield lease
+        finally:
+            await lease.end()
 
 
 @pytest.mark.slow

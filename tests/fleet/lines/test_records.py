@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from fleets import MemoryBucket
 from nats_clusters import Cluster, connected_path
+from tables import table
 
 from multidrop.fleet.errors import OutcomeUnknown
 from multidrop.fleet.leases.rules import USUAL
@@ -246,37 +247,33 @@ def move(turn: int, before: str | None, after: str, line: str = "hall-1") -> Mov
     return Move(line, turn, 1000 * turn, before, after)
 
 
-OWNER_1 = move(1, "", "gw-1")
+FIRST, RELEASE, CLAIM = move(1, "", "gw-1"), move(2, "gw-1", ""), move(3, "", "gw-2")
+MOVED, UNKNOWN_FORMER = move(2, "gw-1", "gw-2"), move(2, None, "gw-2")
+MOVED_ONCE = [("gw-1", "gw-2"), ("", "gw-1")]
 
 
-def test_the_newest_move_of_a_line_is_listed_first() -> None:
-    assert told(OWNER_1, move(2, "gw-1", "gw-2")) == [("gw-1", "gw-2"), ("", "gw-1")]
-
-
-def test_a_release_and_the_following_claim_of_a_line_are_one_move() -> None:
-    moves = [OWNER_1, move(2, "gw-1", ""), move(3, "", "gw-2")]
-    assert told(*moves) == told(*reversed(moves)) == [("gw-1", "gw-2"), ("", "gw-1")]
-
-
-def test_the_move_of_a_released_line_has_no_new_master() -> None:
-    assert told(OWNER_1, move(2, "gw-1", "")) == [("gw-1", ""), ("", "gw-1")]
-
-
-def test_a_report_of_a_move_with_the_former_master_replaces_one_without() -> None:
-    assert told(move(2, None, "gw-2"), move(2, "gw-1", "gw-2")) == [("gw-1", "gw-2")]
-    assert told(move(2, "gw-1", "gw-2"), move(2, None, "gw-2")) == [("gw-1", "gw-2")]
+@table(
+    ("moves", "shown"),
+    [
+        ([FIRST, MOVED], MOVED_ONCE),
+        ([FIRST, RELEASE, CLAIM], MOVED_ONCE),
+        ([CLAIM, RELEASE, FIRST], MOVED_ONCE),
+        ([FIRST, RELEASE], [("gw-1", ""), ("", "gw-1")]),  # the line has no new master yet
+        ([UNKNOWN_FORMER, MOVED], [("gw-1", "gw-2")]),
+        ([MOVED, UNKNOWN_FORMER], [("gw-1", "gw-2")]),
+        ([RELEASE, CLAIM._replace(line="hall-2")], [("", "gw-2"), ("gw-1", "")]),
+    ],
+)
+def test_reports_of_moves_are_shown_newest_first(moves: list[Move], shown: list[tuple[str, str]]) -> None:
+    """A release and the following claim of the same line are shown as one move."""
+    assert told(*moves) == shown
 
 
 def test_a_release_and_a_claim_by_two_gateways_are_one_move() -> None:
     """One gateway reports only the release, the other only the claim."""
-    giver, taker = [OWNER_1, move(2, "gw-1", "")], [move(2, None, ""), move(3, "", "gw-2")]
+    giver, taker = [FIRST, RELEASE], [move(2, None, ""), CLAIM]
     back = [move_of(one.as_json()) for one in (*giver, *taker, *giver)]
-    assert told(*back) == [("gw-1", "gw-2"), ("", "gw-1")]
-
-
-def test_moves_of_different_lines_are_separate() -> None:
-    moves = told(move(2, "gw-1", ""), move(3, "", "gw-2", "hall-2"))
-    assert moves == [("", "gw-2"), ("gw-1", "")]
+    assert told(*back) == MOVED_ONCE
 
 
 def test_a_move_is_read_back_unchanged_from_json() -> None:

@@ -150,6 +150,15 @@ def failed(unopened: UnopenedLines, line: str) -> None:
         unopened.failed(line)
 
 
+def reported(*lines: str) -> tuple[HandClock, UnopenedLines]:
+    """Return a clock, and the lines that a gateway could not open."""
+    clock = HandClock()
+    unopened = UnopenedLines(clock)
+    for line in lines:
+        failed(unopened, line)
+    return clock, unopened
+
+
 def test_a_line_is_reported_after_three_failed_openings() -> None:
     unopened = UnopenedLines(HandClock())
     for _ in range(OPENINGS - 1):
@@ -201,10 +210,7 @@ def test_a_line_with_a_lost_port_is_reported_after_6_s(silent_s: float | None, n
 
 
 def test_one_reported_line_is_tried_at_a_time_with_increasing_pauses() -> None:
-    clock = HandClock()
-    unopened = UnopenedLines(clock)
-    for line in "abc":
-        failed(unopened, line)
+    clock, unopened = reported(*"abc")
     wait_s = FIRST_WAIT_NS / SECOND
     for line in "abcab":
         clock.pass_s(wait_s - 1)
@@ -217,10 +223,7 @@ def test_one_reported_line_is_tried_at_a_time_with_increasing_pauses() -> None:
 
 
 def test_lines_reported_by_all_gateways_are_tried_first_and_regularly() -> None:
-    clock = HandClock()
-    unopened = UnopenedLines(clock)
-    for line in "abc":
-        failed(unopened, line)
+    clock, unopened = reported(*"abc")
     unopened.hopeless = frozenset("b")
     for _ in range(5):
         clock.pass_s(FIRST_WAIT_NS / SECOND)
@@ -232,10 +235,7 @@ def test_lines_reported_by_all_gateways_are_tried_first_and_regularly() -> None:
 
 
 def test_after_a_successful_trial_the_other_reported_lines_are_tried_at_once() -> None:
-    clock = HandClock()
-    unopened = UnopenedLines(clock)
-    for line in "abc":
-        failed(unopened, line)
+    clock, unopened = reported(*"abc")
     clock.pass_s(FIRST_WAIT_NS / SECOND)
     for line, left in (("a", {"b", "c"}), ("b", {"c"}), ("c", set[str]())):
         assert unopened.named() == left
@@ -244,10 +244,7 @@ def test_after_a_successful_trial_the_other_reported_lines_are_tried_at_once() -
 
 def test_a_gateway_tries_its_own_reported_lines_first() -> None:
     """If it tried a line that is assigned to another gateway, it would not get the line back."""
-    clock = HandClock()
-    unopened = UnopenedLines(clock)
-    for line in "abcd":
-        failed(unopened, line)
+    clock, unopened = reported(*"abcd")
     unopened.home = frozenset("bd")
     clock.pass_s(FIRST_WAIT_NS / SECOND)
     assert unopened.named() == {"a", "c", "d"}
@@ -258,10 +255,7 @@ def test_a_gateway_tries_its_own_reported_lines_first() -> None:
 
 
 def test_a_trial_of_a_reported_line_ends_if_the_line_does_not_come_back() -> None:
-    clock = HandClock()
-    unopened = UnopenedLines(clock)
-    failed(unopened, "a")
-    failed(unopened, "b")
+    clock, unopened = reported("a", "b")
     clock.pass_s(FIRST_WAIT_NS / SECOND)
     assert unopened.named() == {"b"}
     clock.pass_s(max(TRIAL_NS, FIRST_WAIT_NS) / SECOND)
@@ -269,9 +263,7 @@ def test_a_trial_of_a_reported_line_ends_if_the_line_does_not_come_back() -> Non
 
 
 def test_only_lines_that_fit_into_a_lease_record_are_reported() -> None:
-    unopened = UnopenedLines(HandClock())
-    for number in range(MOST_BYTES // 8):
-        failed(unopened, f"line-{number}")
+    _, unopened = reported(*(f"line-{number}" for number in range(MOST_BYTES // 8)))
     assert 0 < sum(len(line) + 4 for line in unopened.named()) <= MOST_BYTES
 
 

@@ -249,11 +249,8 @@ async def test_the_hub_refuses_a_stream_that_has_lost_its_newest_messages(runnin
 
 def kept_in_files(path: ServerPath, folder: Path, place: int) -> Any:
     async def live() -> HubState:
-        sink = ParquetSink(folder)
-        try:
+        with closing(ParquetSink(folder)) as sink:
             return await read_all(path, sink, place)
-        finally:
-            sink.close()
 
     return live()
 

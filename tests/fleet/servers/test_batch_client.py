@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 from nats.aio.client import Client
-from nats_clusters import Cluster, connected_path
+from nats_clusters import Cluster, connected_path, opened_paths
 from tables import table
 
 from multidrop.fleet.errors import OutcomeUnknown
@@ -21,7 +21,7 @@ from multidrop.fleet.servers.batch_client import (
     stored_message,
 )
 from multidrop.fleet.servers.buckets import Bucket, Record
-from multidrop.fleet.servers.connections import ServerPath, connect, paths_of
+from multidrop.fleet.servers.connections import ServerPath, connect
 
 OWNER = {"gateway": "gw-9", "session": 1, "votes": 1, "turn": 1, "since": 0}
 SERVERS = (
@@ -190,22 +190,20 @@ async def test_a_read_that_is_lost_on_a_cut_off_server_is_repeated(
 
 
 async def test_a_read_on_a_cut_off_connection_is_repeated_on_other_connections(one: Cluster) -> None:
-    paths = paths_of(one.urls)
-    await asyncio.gather(*(path.open() for path in paths))
-    asked: list[Request] = []
+    async with opened_paths(one.urls) as paths:
+        asked: list[Request] = []
 
-    async def swallow(request: Request, get: DirectGet, silence_s: float) -> None:
-        asked.append(request)
-        await asyncio.Event().wait()
+        async def swallow(request: Request, get: DirectGet, silence_s: float) -> None:
+            asked.append(request)
+            await asyncio.Event().wait()
 
-    _rested(paths[0])
-    deaf = paths[0]._client
-    assert deaf
-    deaf.batch = swallow
-    bucket = Bucket("plant", lambda: paths[0])
-    assert await asyncio.wait_for(bucket.changes(0), 60) == []
-    assert asked
-    await asyncio.gather(*(path.close() for path in paths))
+        _rested(paths[0])
+        deaf = paths[0]._client
+        assert deaf
+        deaf.batch = swallow
+        bucket = Bucket("plant", lambda: paths[0])
+        assert await asyncio.wait_for(bucket.changes(0), 60) == []
+        assert asked
 
 
 @pytest.mark.usefixtures("way")

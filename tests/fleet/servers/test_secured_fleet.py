@@ -17,7 +17,7 @@ from commands import Run
 from fleets import plant_text
 from nats.aio.client import Client
 from nats.aio.msg import Msg
-from nats_clusters import cluster
+from nats_clusters import cluster, initialised, opened_paths
 from secured_clusters import (
     PATIENCE_S,
     SecuredCluster,
@@ -45,10 +45,8 @@ from multidrop.fleet.samples.samples_stream import (
     subject_of,
 )
 from multidrop.fleet.servers import setup
-from multidrop.fleet.servers.connections import paths_of
 from multidrop.fleet.servers.credentials import inbox_of, public_key
 from multidrop.fleet.servers.rights import OTHERS, rights_of
-from multidrop.fleet.servers.setup import set_up
 from multidrop.samples.spool import Spool
 
 
@@ -259,11 +257,9 @@ def elsewhere(user: str, inboxes: Mapping[str, str]) -> list[str]:
 
 
 async def make_streams(servers: SecuredCluster) -> None:
-    operator = paths_of(servers.urls, servers.options("operator"))
-    await set_up(operator)
-    await create_stream(operator[0], replicas=len(servers.nodes))
-    for path in operator:
-        await path.close()
+    await initialised(servers.urls, **servers.options("operator"))
+    async with opened_paths(servers.urls, **servers.options("operator")) as operator:
+        await create_stream(operator[0], replicas=len(servers.nodes))
 
 
 @asynccontextmanager

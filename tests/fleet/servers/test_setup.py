@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import subprocess
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,7 +12,16 @@ from typing import Any
 import pytest
 from fleets import MemoryBucket
 from free_ports import free_ports
-from nats_clusters import Cluster, cluster, connected_path, old_server_program, server_program
+from kills import BoundProcess
+from nats_clusters import (
+    Cluster,
+    cluster,
+    connected_path,
+    initialised,
+    old_server_program,
+    opened_paths,
+    server_program,
+)
 from tables import table
 
 from multidrop import Plant
@@ -27,39 +35,27 @@ from multidrop.fleet.servers.leaders import have_leaders
 from multidrop.fleet.servers.plant_store import line_of, read_plant, store
 
 
-async def _init(urls: list[str]) -> dict[str, object]:
-    paths = paths_of(urls)
-    try:
-        return await setup.set_up(paths)
-    finally:
-        for path in paths:
-            await path.close()
-
-
 @pytest.mark.slow
 def test_buckets_are_created_on_all_three_servers(nats: Cluster) -> None:
-    made = asyncio.run(_init(nats.urls))
+    made = asyncio.run(initialised(nats.urls))
     assert made["replicas"] == 3
     assert set(made["servers"]) == {"n1", "n2", "n3"}
-    assert asyncio.run(_init(nats.urls)) == made  # a second run changes no bucket
+    assert asyncio.run(initialised(nats.urls)) == made  # a second run changes no bucket
 
 
 @pytest.mark.slow
 async def test_connections_and_bucket_leaders_are_spread_over_all_servers(fleet: Cluster) -> None:
-    paths = paths_of(fleet.urls)
-    await setup.open_all(paths)
-    assert [path.server_name for path in paths] == ["n1", "n2", "n3"]
-    ends = time.monotonic() + 20
-    while True:
-        await setup.bring_leaders_home(paths[0], await setup.led_clusters(paths[0]))
-        infos = [await ask(paths[0], f"STREAM.INFO.KV_lease_{at}") for at in range(3)]
-        leaders = [info["cluster"].get("leader") for info in infos]
-        if leaders == ["n1", "n2", "n3"]:
-            break
-        assert time.monotonic() < ends, leaders
-        await asyncio.sleep(0.2)
-    for path in paths:
-        await path.close()
+    async with opened_paths(fleet.urls) as paths:
+        assert [path.server_name for path in paths] == ["n1", "n2", "n3"]
+        ends = time.monotonic() + 20
+        while True:
+            await setup.bring_leaders_home(paths[0], await setup.led_clusters(paths[0]))
+            infos = [await ask(paths[0], f"STREAM.INFO.KV_lease_{at}") for at in range(3)]
+            leaders = [info["cluster"].get("leader") for info in infos]
+            if leaders == ["n1", "n2", "n3"]:
+                break
+            assert time.monotonic() < ends, leaders
+            await asyncio.sleep(0.2)
 
 
 class Deaf:
@@ -98,14 +94,14 @@ def test_init_refuses_two_writes_to_one_revision(tmp_path: Path, monkeypatch: py
     with cluster(tmp_path, 3, old_server_program()) as old:
         sentence = "same revision of a record: they could give one lease to two gateways"
         with pytest.raises(FleetError, match=sentence):
-            asyncio.run(_init(old.urls))
+            asyncio.run(initialised(old.urls))
 
 
 def test_init_refuses_servers_that_ignore_a_writer(nats: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
     """Such servers would grant a lease to two gateways. Some of their answers may arrive too late."""
     monkeypatch.setattr(LeaseBucket, "_pattern", LeaseBucket._subject)
     with pytest.raises(FleetError, match=r"accepted [2-6] of 6 concurrent writes to the same revision"):
-        asyncio.run(_init(nats.urls))
+        asyncio.run(initialised(nats.urls))
 
 
 @pytest.mark.slow
@@ -126,7 +122,7 @@ def test_init_repeats_an_unanswered_removal_of_its_test_bucket(
         return await ask(path, subject, data)
 
     monkeypatch.setattr(setup, "ask", ask_in_vain)
-    asyncio.run(_init(nats.urls))
+    asyncio.run(initialised(nats.urls))
     assert removals == ["STREAM.DELETE.KV_contest"] * (1 if is_carried_out else 2)
 
 
@@ -139,17 +135,17 @@ def test_init_needs_all_servers_only_when_it_creates_buckets(tmp_path: Path) -> 
         others = [node for node in three.nodes if node is not down]
         down.kill()
         with pytest.raises(FleetError, match=f"^{down.url} does not answer, and new buckets would"):
-            asyncio.run(_init(three.urls))
+            asyncio.run(initialised(three.urls))
         down.start()
         three.wait()
-        assert asyncio.run(_init(three.urls))["replicas"] == 3
+        assert asyncio.run(initialised(three.urls))["replicas"] == 3
         down.kill()
         ends = time.monotonic() + 60
         while not {f"KV_{name}" for name in names.BUCKETS} <= set().union(*(one.leads() for one in others)):
             assert time.monotonic() < ends
             time.sleep(0.1)
         # all servers have a copy, so a plant can still be stored
-        assert asyncio.run(_init(three.urls))["replicas"] == 3
+        assert asyncio.run(initialised(three.urls))["replicas"] == 3
 
 
 @pytest.mark.long
@@ -160,7 +156,7 @@ def test_servers_without_a_quorum_are_reported(tmp_path: Path, monkeypatch: pyte
         for node in three.nodes[1:]:
             node.kill()
         with pytest.raises(FleetError, match="have no quorum: more than half of them must run"):
-            asyncio.run(_init(three.urls[:1]))
+            asyncio.run(initialised(three.urls[:1]))
 
 
 NO_LEADER = (
@@ -177,7 +173,7 @@ def test_servers_that_cannot_decide_have_no_quorum(nats: Cluster, monkeypatch: p
 
     monkeypatch.setattr(ServerPath, "request", refuse)
     with pytest.raises(FleetError, match=r"have no quorum: .* \(nats:.* says: JetStream system temporarily"):
-        asyncio.run(_init(nats.urls))
+        asyncio.run(initialised(nats.urls))
 
 
 @pytest.mark.slow
@@ -191,7 +187,7 @@ def test_init_waits_until_a_new_plant_can_be_read(nats: Cluster, monkeypatch: py
         return await collect(self, subject, data)
 
     monkeypatch.setattr(ServerPath, "collect", fail_at_first)
-    assert asyncio.run(_init(nats.urls))["replicas"] == 3
+    assert asyncio.run(initialised(nats.urls))["replicas"] == 3
     assert failures == []
 
 
@@ -200,16 +196,14 @@ def test_a_server_without_jetstream_is_reported(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(setup, "WAIT_S", 0.5)
     [port] = free_ports(1)
     command = [server_program(), "-a", "127.0.0.1", "-p", str(port)]
-    with (tmp_path / "log").open("wb") as log, subprocess.Popen(command, stdout=log, stderr=log) as server:
-        try:
-            ends = time.monotonic() + 60
-            while b"Server is ready" not in (tmp_path / "log").read_bytes():
-                assert time.monotonic() < ends
-                time.sleep(0.02)
-            with pytest.raises(FleetError, match=r"no JetStream answers at nats:.* needs `jetstream"):
-                asyncio.run(_init([f"nats://127.0.0.1:{port}"]))
-        finally:
-            server.kill()
+    with (tmp_path / "log").open("wb") as log, BoundProcess(command, stdout=log, stderr=log) as server:
+        ends = time.monotonic() + 60
+        while b"Server is ready" not in (tmp_path / "log").read_bytes():
+            assert time.monotonic() < ends
+            time.sleep(0.02)
+        with pytest.raises(FleetError, match=r"no JetStream answers at nats:.* needs `jetstream"):
+            asyncio.run(initialised([f"nats://127.0.0.1:{port}"]))
+        server.kill()
 
 
 @pytest.mark.slow

@@ -266,15 +266,6 @@ def test_the_example_of_the_modbus_guide_is_parsed_and_answered() -> None:
     assert found.exception(2) == bytes.fromhex("15 01 00 00 00 03 FF 83 02")
 
 
-def test_a_request_that_arrives_byte_by_byte_is_parsed() -> None:
-    buffer = bytearray()
-    for byte in PRINTED[:-1]:
-        buffer.append(byte)
-        assert take_request(buffer) is None
-    buffer.append(PRINTED[-1])
-    assert take_request(buffer) is not None
-
-
 @table(
     "header",
     [

@@ -7,6 +7,7 @@ import json
 import signal
 import time
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import replace
 from datetime import UTC, datetime
 from enum import IntEnum
@@ -61,9 +62,8 @@ def test_the_newest_values_are_retained(broker: Broker, listener: Listener, star
     start()
     listener.wait_for(has("multidrop/gateway", b"online"))
     listener.wait_for(has(f"multidrop/{FAN.name}/available", b"online"))
-    later = Listener(broker)
-    said = later.wait_for(has("multidrop/pump-1"))
-    later.close()
+    with closing(Listener(broker)) as later:
+        said = later.wait_for(has("multidrop/pump-1"))
     assert said.is_retained
     assert json_of(said) == {
         "time": 7,
@@ -90,18 +90,14 @@ def test_the_message_offline_is_retained(broker: Broker, listener: Listener, sta
     running._part._brokers[0]._client.reconnect_delay_set(3600, 3600)
     running.cut(0)
     listener.wait_for(has("multidrop/gateway", b"offline"))
-    later = Listener(broker)
-    try:
+    with closing(Listener(broker)) as later:
         assert later.wait_for(has("multidrop/gateway")) == ("multidrop/gateway", True, b"offline")
-    finally:
-        later.close()
 
 
 def test_messages_without_a_connection_are_counted_as_dropped(tmp_path: Path) -> None:
     require_module("paho.mqtt.client")
     part: Any = build(MqttSettings(f"mqtt://127.0.0.1:{free_port()}", sparkplug="works"), inside(tmp_path))
-    running = Running(part)
-    try:
+    with closing(Running(part)) as running:
         of_json, of_sparkplug = (broker.outbox for broker in part._brokers)
         assert (of_json.dropped, of_sparkplug.dropped) == (0, 0)
         running.step()
@@ -113,8 +109,6 @@ def test_messages_without_a_connection_are_counted_as_dropped(tmp_path: Path) ->
         assert (of_json.dropped, of_sparkplug.dropped) == (6, 1)
         (dropped,) = (one for one in part.figures() if one.name == "multidrop_mqtt_dropped")
         assert [value for _, _, value in dropped.samples] == [7]
-    finally:
-        running.close()
 
 
 def test_closing_the_gateway_publishes_offline(broker: Broker, listener: Listener, tmp_path: Path) -> None:
@@ -192,10 +186,9 @@ def test_a_restarted_broker_gets_all_messages(broker: Broker, listener: Listener
     listener.wait_for(has("multidrop/gateway", b"online"))
     broker.kill()
     broker.start()
-    again = Listener(broker)
-    again.wait_for(has("multidrop/gateway", b"online"))
-    again.wait_for(has("multidrop/pump-1"))
-    again.close()
+    with closing(Listener(broker)) as again:
+        again.wait_for(has("multidrop/gateway", b"online"))
+        again.wait_for(has("multidrop/pump-1"))
 
 
 @pytest.fixture
@@ -797,9 +790,8 @@ def test_topics_of_removed_drives_are_deleted(broker: Broker, listener: Listener
         listener.wait_for(has(topic, b""))
     listener.wait_for(has(discovery_topic("multidrop", "pump-1")))
     listener.wait_for(has("multidrop/pump-1/available", b"online"))
-    later = Listener(broker)
-    later.wait_for(has("multidrop/pump-1"))
-    running.step()
-    told = later.wait_for(lambda received: received.topic in ("multidrop/pump-1", *topics))
-    assert told.topic == "multidrop/pump-1"
-    later.close()
+    with closing(Listener(broker)) as later:
+        later.wait_for(has("multidrop/pump-1"))
+        running.step()
+        told = later.wait_for(lambda received: received.topic in ("multidrop/pump-1", *topics))
+        assert told.topic == "multidrop/pump-1"

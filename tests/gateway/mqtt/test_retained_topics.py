@@ -136,8 +136,7 @@ def test_retained_messages_of_a_killed_gateway_are_deleted(broker: Broker, tmp_p
         publish(broker, topic, b"online", "-r")
     foreign = discovery_topic("multidrop", "old")
     publish(broker, foreign, configuration("elsewhere/old"), "-r")
-    listener = Listener(broker)
-    try:
+    with closing(Listener(broker)) as listener:
         live_and_die(broker, tmp_path, listener)
         fan = f"multidrop/{FAN.name}"
         topics = {fan, f"{fan}/available", discovery_topic("multidrop", FAN.name)}
@@ -154,8 +153,6 @@ def test_retained_messages_of_a_killed_gateway_are_deleted(broker: Broker, tmp_p
                 *("multidrop/gateway", "multidrop/alarms", "multidrop/pump-1", "multidrop/pump-1/available"),
                 discovery_topic("multidrop", "pump-1"),
             }
-    finally:
-        listener.close()
 
 
 SERVE = """[serve.may]
@@ -227,24 +224,24 @@ rows = true
 @pytest.mark.long
 def test_values_and_alarms_of_a_computed_channel_are_published(tmp_path: Path) -> None:
     require_module("paho.mqtt.client")
-    with mosquitto(tmp_path) as broker, served(tmp_path, CHANNEL.format(broker.address)):
-        listener = Listener(broker, "multidrop/#")
-        try:
-            listener.wait_for(
-                lambda one: (
-                    one.topic == "multidrop/pump-2" and json.loads(one.payload)["values"].get("half") == 25.0
-                )
+    with (
+        mosquitto(tmp_path) as broker,
+        served(tmp_path, CHANNEL.format(broker.address)),
+        closing(Listener(broker, "multidrop/#")) as listener,
+    ):
+        listener.wait_for(
+            lambda one: (
+                one.topic == "multidrop/pump-2" and json.loads(one.payload)["values"].get("half") == 25.0
             )
-            found = listener.wait_for(lambda one: one.topic.endswith("/rows") and b'"half"' in one.payload)
-            row = next(row for row in json.loads(found.payload)["rows"] if row["register"] == "half")
-            assert (row["drive"], row["value"], row["unit"], row["status"]) == ("pump-2", 25.0, "Hz", "ok")
-            with closing(Listener(broker, "multidrop/#")) as later:
-                found = later.wait_for(lambda one: one.topic == "multidrop/alarms" and one.payload != b"[]")
-            [alarm] = json.loads(found.payload)
-            assert (alarm["drive"], alarm["kind"]) == ("pump-2", "limit")
-            assert "half above 10 Hz" in alarm["text"]
-        finally:
-            listener.close()
+        )
+        found = listener.wait_for(lambda one: one.topic.endswith("/rows") and b'"half"' in one.payload)
+        row = next(row for row in json.loads(found.payload)["rows"] if row["register"] == "half")
+        assert (row["drive"], row["value"], row["unit"], row["status"]) == ("pump-2", 25.0, "Hz", "ok")
+        with closing(Listener(broker, "multidrop/#")) as later:
+            found = later.wait_for(lambda one: one.topic == "multidrop/alarms" and one.payload != b"[]")
+        [alarm] = json.loads(found.payload)
+        assert (alarm["drive"], alarm["kind"]) == ("pump-2", "limit")
+        assert "half above 10 Hz" in alarm["text"]
 
 
 # ---- the Node-RED flow in the documentation uses only topics of the gateway ----

@@ -279,17 +279,15 @@ def test_an_opc_ua_client_that_reads_nothing_delays_no_poll_and_no_stop(gateway:
     words = [sys.executable, str(SUBSCRIBER), url_of(gateway), "50"]
     gateway.start("pump-1", "pump-2")
     with BoundProcess(words, stdout=subprocess.PIPE, text=True) as subscriber:
-        try:
-            assert subscriber.stdout is not None
-            assert subscriber.stdout.readline()
-            subscriber.send_signal(signal.SIGSTOP)
-            rows = gateway.gateway.hub.taken
-            until(lambda: gateway.gateway.hub.taken > rows + 20)
-            assert "stop" in stop(client, "pump-1")
-            until(lambda: gateway.stands("pump-1"))
-            assert gateway.post("/api/stop").json["pump-2"]["done"] is True
-        finally:
-            subscriber.kill()
+        assert subscriber.stdout is not None
+        assert subscriber.stdout.readline()
+        subscriber.send_signal(signal.SIGSTOP)
+        rows = gateway.gateway.hub.taken
+        until(lambda: gateway.gateway.hub.taken > rows + 20)
+        assert "stop" in stop(client, "pump-1")
+        until(lambda: gateway.stands("pump-1"))
+        assert gateway.post("/api/stop").json["pump-2"]["done"] is True
+        subscriber.kill()
 
 
 @pytest.mark.slow

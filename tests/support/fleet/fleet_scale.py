@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -155,11 +155,8 @@ def plant_of_fake_lines(lines: int) -> dict[str, Any]:
 @contextmanager
 def large_fleet(nats: Cluster, lines: dict[str, Any]) -> Iterator[LargeFleet]:
     """Yield a fleet for this plant, without any gateway yet."""
-    fleet = LargeFleet(nats, lines)
-    try:
+    with closing(LargeFleet(nats, lines)) as fleet:
         yield fleet
-    finally:
-        fleet.close()
 
 
 def groups(gateways: int, processes: int) -> list[list[str]]:

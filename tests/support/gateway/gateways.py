@@ -9,7 +9,7 @@ import os
 import subprocess
 import threading
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -74,18 +74,16 @@ class Served:
 
     def request(self, method: str, path: str, body: object = None, **headers: str) -> Answer:
         """Send a request on a new connection; return the response. In header names _ becomes -."""
-        connection = http.client.HTTPConnection("127.0.0.1", self.gateway.port, timeout=PATIENCE)
         sent = {name.replace("_", "-"): value for name, value in headers.items()}
         data = None
         if method == "POST":
             data = body if isinstance(body, bytes) else json.dumps(body if body is not None else {})
             sent.setdefault("content-type", "application/json")
-        try:
+        to = http.client.HTTPConnection("127.0.0.1", self.gateway.port, timeout=PATIENCE)
+        with closing(to) as connection:
             connection.request(method, path, data, sent)
             response = connection.getresponse()
             return Answer(response.status, {k.lower(): v for k, v in response.getheaders()}, response.read())
-        finally:
-            connection.close()
 
     def get(self, path: str, **headers: str) -> Answer:
         return self.request("GET", path, **headers)

@@ -45,10 +45,8 @@ def running(*words: object) -> Iterator[tuple[subprocess.Popen[str], IO[str]]]:
     """Start a command; yield its process and its output stream."""
     with BoundProcess([*MULTIDROP, *map(str, words)], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
-        try:
-            yield process, process.stdout
-        finally:
-            process.kill()
+        yield process, process.stdout
+        process.kill()
 
 
 def plant_file(directory: Path, *, dead: bool = False) -> Path:

@@ -10,7 +10,7 @@ import signal
 import subprocess
 import time
 import urllib.request
-from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Sequence
 from contextlib import asynccontextmanager, closing, contextmanager, suppress
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
@@ -22,6 +22,7 @@ from peers import require_program
 
 from multidrop.fleet.servers.connections import ServerPath, paths_of
 from multidrop.fleet.servers.files import PINGS
+from multidrop.fleet.servers.setup import open_all, set_up
 
 PATIENCE_S = 60.0
 ATTEMPTS = 4
@@ -216,11 +217,34 @@ def started_cluster(make: Callable[[int], C]) -> Iterator[C]:
         if running.is_ready_within(PATIENCE_S) or not running.has_ended():
             break
         running.close()
-    try:
+    with closing(running):
         running.wait()
         yield running
+
+
+@asynccontextmanager
+async def opened_paths(urls: Sequence[str], **options: Any) -> AsyncIterator[list[ServerPath]]:
+    """Open the three connections of one gateway, and close them at the end."""
+    paths = paths_of(urls, options)
+    try:
+        await open_all(paths)
+        yield paths
     finally:
-        running.close()
+        await close_all(paths)
+
+
+async def close_all(paths: Iterable[ServerPath]) -> None:
+    for path in paths:
+        await path.close()
+
+
+async def initialised(urls: Sequence[str], **options: Any) -> dict[str, Any]:
+    """Create the buckets as `fleet init` does; return its summary."""
+    paths = paths_of(urls, options)
+    try:
+        return await set_up(paths)
+    finally:
+        await close_all(paths)
 
 
 @asynccontextmanager

@@ -9,7 +9,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any
@@ -109,8 +109,5 @@ class Postgres:
 
 @contextmanager
 def postgres() -> Iterator[Postgres]:
-    running = Postgres()
-    try:
+    with closing(Postgres()) as running:
         yield running
-    finally:
-        running.close()

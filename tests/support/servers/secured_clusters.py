@@ -214,11 +214,10 @@ def secured_fleet(
     environments: Mapping[str, Mapping[str, str]] | None = None,
 ) -> Iterator[SecuredFleet]:
     """Yield a fleet on `number` servers with all gateways started."""
-    with secured_cluster(folder / "nats", number, gateways) as servers:
-        fleet = SecuredFleet(folder, servers)
-        try:
-            for name in gateways:
-                fleet.start(name, **(environments or {}).get(name, {}))
-            yield fleet
-        finally:
-            fleet.close()
+    with (
+        secured_cluster(folder / "nats", number, gateways) as servers,
+        closing(SecuredFleet(folder, servers)) as fleet,
+    ):
+        for name in gateways:
+            fleet.start(name, **(environments or {}).get(name, {}))
+        yield fleet
