@@ -27,7 +27,7 @@ LATE_NS = 1_000_000_000  # how long a recording stays open after its end, for ro
 _log = logging.getLogger("multidrop.recording")
 
 
-class Moment(NamedTuple):
+class TriggerTime(NamedTuple):
     """The time of a trigger, and the text of its condition."""
 
     condition: str
@@ -97,20 +97,20 @@ class TriggeredWriter(RecordingWriter):
         ):
             self._before.popleft()
 
-    def _moments(self, batch: Batch) -> Iterator[Moment]:
+    def _moments(self, batch: Batch) -> Iterator[TriggerTime]:
         columns = batch.columns()
         for at, register in enumerate(columns.register):
             series = columns.drives[columns.drive[at]], columns.registers[register]
             if series == (EVENT, TRIGGER):
                 text = columns.statuses[columns.status[at]]
-                yield Moment(text, columns.time[at], columns.monotonic_ns[at])
+                yield TriggerTime(text, columns.time[at], columns.monotonic_ns[at])
             elif series in self._conditions and columns.status[at] == 0:
                 is_true = bool(columns.value[at])
                 if is_true and self._was.get(series) is False:
-                    yield Moment(self._conditions[series], columns.time[at], columns.monotonic_ns[at])
+                    yield TriggerTime(self._conditions[series], columns.time[at], columns.monotonic_ns[at])
                 self._was[series] = is_true
 
-    def _begin(self, moment: Moment) -> None:
+    def _begin(self, moment: TriggerTime) -> None:
         if len(self._open) == MOST_OPEN:
             self.dropped += 1
             _log.warning("trigger %s is not recorded: %d recordings are open", moment.condition, MOST_OPEN)
