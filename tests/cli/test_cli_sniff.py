@@ -450,3 +450,14 @@ def test_decode_prints_times_of_day_in_utc(run: Run, capture: Path, monkeypatch:
     finally:
         monkeypatch.undo()
         tzset()
+
+
+def test_an_infinite_value_is_null_in_json(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "meter.py").write_text(METER)
+    drive = 'name = "meter"\nmodel = "meter.py:Meter"\naddress = 1\n'
+    plant = tmp_path / "plant.toml"
+    plant.write_text(f'[[line]]\nname = "hall-1"\nport = "/dev/none"\n[[line.drive]]\n{drive}')
+    frames = [frame(True, 1, 0x03, 7, 2), frame(False, 1, 0x03, 0, 0, bytes.fromhex("FF 80 00 00"))]
+    told(run, tmp_path / "a.pcapng", frames, "--plant", plant)
+    (line, _) = run("decode", tmp_path / "a.pcapng", "--plant", plant, "--json")[1].splitlines()
+    assert '"values": {"power": null}' in line

@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from math import isfinite
 from typing import Any
 
 from multidrop.capture.pairing import Junk, Sniffed, SniffedExchange
@@ -312,7 +313,9 @@ def _hex(raw: bytes) -> str:
 def _number(place: RegisterPlace, data: bytes) -> float | int | None:
     if place.register is not None:
         number = place.register.number_in(data, place.at)
-        return number if number is None or place.register.values is None else int(number)
+        if number is None or not isfinite(number):  # JSON has no infinity
+            return None
+        return number if place.register.values is None else int(number)
     raw = raw_value(data, place.at, place.number_format)
     # NaN (`raw != raw`) means that the reply ends before this register
     return int(raw) if raw == raw else None
