@@ -236,17 +236,32 @@ def test_a_full_spool_removes_its_oldest_messages(folder: Path, caplog: pytest.L
     assert "the spool is full at" in caplog.text
 
 
-def test_rows_removed_while_the_streams_position_is_unknown_are_counted_later(folder: Path) -> None:
+@pytest.mark.parametrize(("most", "sent", "lost"), [(1000, 2, 4), (4, 4, 2), (4, 3, 6)])
+def test_rows_removed_while_the_streams_position_is_unknown_are_counted_later(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, most: int, sent: int, lost: int
+) -> None:
+    """If more messages are removed than the spool remembers, it counts whole ranges of messages as lost."""
+    monkeypatch.setattr(spool_module, "MOST_UNDECIDED", most)
     filled(folder, 6)
     spool = Spool(folder, GATEWAY, most=1)  # the newest message is kept even beyond the limit
     store(spool, 30, 5)
     until(lambda: spool.state().oldest == 7)
     assert spool.state().lost == 0
-    spool.acknowledge(2)
-    assert spool.state().lost == 4 * 50
+    assert len(spool._undecided) <= most
+    spool.acknowledge(sent)
+    assert spool.state().lost == lost * 50
     spool.acknowledge(7)
-    assert spool.state().lost == 4 * 50
+    assert spool.state().lost == lost * 50
     spool.close()
+
+
+def test_rows_appended_to_a_closed_spool_are_lost_for_that_reason(
+    spool: Spool, caplog: pytest.LogCaptureFixture
+) -> None:
+    spool.close()
+    spool.append(numbered(0, 5))
+    assert spool.state().lost == 50
+    assert "the spool is closed: 50 rows of the spool" in caplog.text
 
 
 @pytest.mark.slow

@@ -40,6 +40,7 @@ _TEMPORARY = re.compile(r"\..+\.tmp")
 ENOUGH_ROWS = 1 << 14  # a message is written when this many rows wait in memory
 ENOUGH_S = 1.0  # a message is written when its oldest row has waited this long
 MOST_WAITING = 1_000_000  # limit of rows that wait in memory while the disk is slow or full: 38 MB
+MOST_UNDECIDED = 10_000  # an even limit of remembered ranges of removed messages; at it, pairs are joined
 AGAIN_S = 1.0  # pause after a disk error
 LOG_S = 60.0  # time between log lines about lost rows
 ENDING_S = 10.0  # time limit of `close` for writing to the disk
@@ -159,6 +160,17 @@ def _parsed(path: Path) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
+class RemovedMessages(NamedTuple):
+    """Successive messages that the spool has removed, and the number of their rows."""
+
+    first: int
+    last: int
+    rows: int
+
+    def joined(self, later: RemovedMessages) -> RemovedMessages:
+        return RemovedMessages(self.first, later.last, self.rows + later.rows)
+
+
 class SpoolState(NamedTuple):
     """The state of a spool. Counts of rows start when the spool is opened."""
 
@@ -210,9 +222,8 @@ class Spool:
         self._taken = self._written = self._lost = 0
         self._acknowledged: int | None = None
         self._missing: Sequence[tuple[int, int]] = ()
-        # removed messages that the receiver may not have, with the number of their rows: `acknowledge`
-        # decides whether these rows are lost
-        self._undecided: dict[int, int] = {}
+        # removed messages that the receiver may not have: `acknowledge` decides whether they are lost
+        self._undecided: list[RemovedMessages] = []
         self._trouble: str | None = None
         self._logged_s: float | None = None
         self._wanted = 0  # `sync` waits until this many of the appended rows are on the disk
@@ -230,7 +241,7 @@ class Spool:
         with self._changing:
             rows = len(columns.time)
             if self._over or self._in_memory() + rows > MOST_WAITING:
-                self._lose(rows, "the disk is too slow")
+                self._lose(rows, "the spool is closed" if self._over else "the disk is too slow")
                 return
             if not self._waiting or not self._waiting[-1].add(columns):
                 self._waiting.append(RowBuffer())
@@ -288,16 +299,19 @@ class Spool:
         """
         with self._changing:
             self._acknowledged, self._missing = sequence, missing
-            for removed, rows in self._undecided.items():
-                if not self._is_sent(removed):
-                    self._lose(rows, f"the spool is full at {self._most} bytes")
+            for removed in self._undecided:
+                if not self._are_sent(removed.first, removed.last):
+                    self._lose(removed.rows, f"the spool is full at {self._most} bytes")
             self._undecided.clear()
 
     def _is_sent(self, sequence: int) -> bool:
+        return self._are_sent(sequence, sequence)
+
+    def _are_sent(self, first: int, last: int) -> bool:
         with self._changing:
-            if self._acknowledged is None or sequence > self._acknowledged:
+            if self._acknowledged is None or last > self._acknowledged:
                 return False
-            return not any(first <= sequence <= last for first, last in self._missing)
+            return not any(begin <= last and first <= end for begin, end in self._missing)
 
     # ---- for the spool's own thread ----
 
@@ -410,7 +424,10 @@ class Spool:
             del self._folder.messages[message.sequence]
             self._stored -= message.size
             if self._acknowledged is None:
-                self._undecided[message.sequence] = message.rows
+                self._undecided.append(RemovedMessages(message.sequence, message.sequence, message.rows))
+                if len(self._undecided) == MOST_UNDECIDED:
+                    pairs = zip(self._undecided[::2], self._undecided[1::2], strict=True)
+                    self._undecided = [one.joined(later) for one, later in pairs]
             elif not self._is_sent(message.sequence):
                 self._lose(message.rows, f"the spool is full at {self._most} bytes")
         return True

@@ -15,6 +15,7 @@ from lines import until
 from spooled import exchanges_in, numbered, rows_of
 from tables import table
 
+from multidrop.gateway.forward import forwarder as forwarder_module
 from multidrop.gateway.forward.forwarder import MOST_GAPS, RowForwarder, SpoolPosition
 from multidrop.gateway.sending import Refused
 from multidrop.samples import Spool
@@ -215,6 +216,12 @@ def test_no_message_is_lost_while_the_receiver_refuses_all_messages(clocked: Clo
     clocked.send_all()
     assert sorted(clocked.receiver.sequences) == [1, 2, 3, 4, 5]
     assert clocked.forwarder.refused == 0
+
+
+def test_few_refusals_are_remembered(clocked: Clocked, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(forwarder_module, "MOST_REFUSALS", 2)
+    test_no_message_is_lost_while_the_receiver_refuses_all_messages(clocked)
+    assert [*clocked.forwarder._refusals] == [4, 5]
 
 
 def test_a_hanging_receiver_is_reported(clocked: Clocked) -> None:

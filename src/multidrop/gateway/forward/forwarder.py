@@ -38,6 +38,7 @@ NOT_FINITE = "not a finite number"  # status of a row whose value JSON and Influ
 REMOVED_S = 0.01  # pause in s if the spool is full and has just removed the next message
 # limit of gaps. A gap is a range of messages that were skipped in order to send a newer message first.
 MOST_GAPS = 64
+MOST_REFUSALS = 1000  # limit of remembered refusals; the oldest are forgotten
 SET_BACK = (
     "the receiver has message {} of the spool {}, which ends at message {}: the folder was copied or set "
     "back; move it away to start a new spool"
@@ -271,6 +272,8 @@ class RowForwarder(RetryingSender):
         If no other message was accepted, a wrong setting may be the cause. Skipping each refused message
         would then lose all messages.
         """
+        if sequence not in self._refusals and len(self._refusals) >= MOST_REFUSALS:
+            del self._refusals[next(iter(self._refusals))]
         return self._accepted > self._refusals.setdefault(sequence, self._accepted)
 
     def _leave_out(self, stored: StoredMessage, why: str) -> None:
