@@ -302,6 +302,7 @@ def test_after_five_wrong_tokens_an_address_is_refused_but_may_stop(tmp_path: Pa
             assert gateway.get("/api/plant", **anna, authorization=f"Bearer wrong-{at}").status == 401
         assert gateway.get("/api/plant", **wrong).status == 429
         assert gateway.get("/api/plant", **right).status == 429
+        assert gateway.post("/api/acknowledge", {"alarm": "1"}, **right).status == 429
         assert gateway.post("/api/token", {"token": gateway.secrets[Right.STOP]}, **anna).status == 429
         assert gateway.post(*STOP, **right).json["pump-1"]["done"] is True
         assert gateway.post(*STOP, **wrong).status == 401

@@ -37,6 +37,7 @@ ENDS = "the gateway is shutting down: the outcome of this request is unknown"
 BODY_HEADERS = (b"content-length", b"transfer-encoding")
 # paths of stop requests; a request to VERB_PATH may be a stop too, depending on its body
 STOP_PATHS, VERB_PATH = ("/api/stop", "/api/fleet/stop"), "/api/act"
+MAY_STOP = frozenset((*STOP_PATHS, VERB_PATH))
 BACKLOG = 64  # limit of new connections that the operating system holds until the gateway accepts them
 _WHY = {
     errno.EADDRINUSE: "another program listens there",

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from multidrop.gateway.http.connections import MAY_STOP
 from multidrop.gateway.http.messages import Denied, JsonResponse
 from multidrop.gateway.http.rights import (
     ANYONE,
@@ -126,7 +127,7 @@ class Guard:
             )
         path: str = scope["path"]
         needed = self._find(path)
-        if needed.right is not Right.STOP and _length(scope) > MOST_HEAD:
+        if path not in MAY_STOP and _length(scope) > MOST_HEAD:
             raise Denied(431, f"the headers are longer than {MOST_HEAD} bytes")
         if scope["method"] != needed.method and (scope["method"], needed.method) != ("HEAD", "GET"):
             raise Denied(405, f"{path[:100]!r} takes only {needed.method}")
@@ -171,13 +172,14 @@ class Guard:
         secret, way = _secret(headers)
         secret = secret if self._tokens else ""  # without tokens of its own, the gateway ignores any token
         token: Token | None = None
-        is_shut = needed is not Right.STOP and self._tokens.is_shut(address, self._clock())
+        may_stop = scope["path"] in MAY_STOP
+        is_shut = not may_stop and self._tokens.is_shut(address, self._clock())
         if secret and not is_shut:
             token = self._tokens.find(secret)
             if token is None and self._tokens.note_wrong(address, secret, self._clock()):
                 _log.warning("wrong token from %s", address)
         if secret and token is None:
-            if needed is not Right.STOP or free is None or free < Right.STOP:
+            if not may_stop or free is None or free < Right.STOP:
                 raise Denied(429, SHUT) if is_shut else Denied(401, WRONG)
             scope[HAS_WRONG_TOKEN] = True
         caller = caller_with(token, free, way, address)

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from multidrop.gateway.http import schemas
+from multidrop.gateway.http.connections import MAY_STOP
 from multidrop.gateway.http.files import TYPES
 from multidrop.gateway.http.guard import RouteAccess
 from multidrop.gateway.http.rights import Right
@@ -329,7 +330,7 @@ def _of_the_guard(one: Operation) -> set[int]:
     found = {403, 421, 503}
     if one.right is not None:
         found |= {401}
-    if one.right is not Right.STOP:
+    if one.path not in MAY_STOP:
         found |= {HEADERS_TOO_LONG}
         found |= {429} if one.right is not None else set()
     return found | ({415} if one.method == "POST" else set())
