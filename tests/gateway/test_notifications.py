@@ -349,3 +349,19 @@ def test_faults_and_exceeded_limits_are_sent_as_messages(tmp_path: Path, webhook
     assert found["pump-1", "limit"] == "output_frequency below 1 Hz"
     # The status may be read before the register that has the number of the fault.
     assert found["pump-1", "fault"] in ("overcurrent while accelerating (OC1)", "it shows a fault")
+
+
+def test_alarms_left_out_while_a_message_is_sent_are_counted_in_the_next_one() -> None:
+    target = Clocked()
+    send = target.sender._send
+
+    def send_slowly(message: dict[str, Any]) -> None:
+        if not target.messages:
+            for number in range(MOST_WAITING + 100):
+                target.sender.put(BEGUN._replace(drive=f"pump-{number}"))
+        send(message)
+
+    target.sender._send = send_slowly
+    target.sender.put(BEGUN)
+    target.send_all()
+    assert target.messages[1]["text"].endswith("(100 earlier messages were left out)")

@@ -18,7 +18,7 @@ from recordings import record_as_before
 
 from multidrop import History
 from multidrop.history import growing
-from multidrop.history.buckets import grid_of
+from multidrop.history.buckets import Accumulator, grid_of
 from multidrop.history.compact import compact
 from multidrop.history.database import Database
 from multidrop.history.sources import Replaced, Sources
@@ -419,3 +419,11 @@ def test_a_segment_of_version_0_1_with_too_many_names_is_damaged(tmp_path: Path)
     with History(tmp_path / "run.arrows") as history:
         assert rows_in(history) == []
         assert "65537 names; the limit is 65536" in history.damage[0]
+
+
+@pytest.mark.parametrize("value", [0.1, 1.7e308, -1.7e308])
+def test_mean_of_equal_values_is_this_value(value: float) -> None:
+    """Their sum is rounded, or exceeds the largest float."""
+    gathered = Accumulator(grid_of(0, 10, 1))
+    gathered.add_rows([1] * 1000, [value] * 1000, [1] * 1000)
+    assert gathered.buckets().mean == [value]

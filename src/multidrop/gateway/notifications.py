@@ -210,11 +210,13 @@ class AlarmQueue:
             return None, (1 - self._allowed) / rate
         return self._waiting[0], 0.0
 
-    def note_sent(self, alarm: Alarm) -> None:
-        """Remove an alarm that `next` returned, because its message was sent."""
+    def note_sent(self, alarm: Alarm, left_out: int) -> None:
+        """Remove an alarm that `next` returned, because its message, which states `left_out`, was sent."""
+        # while the message was sent, more alarms may have been left out, maybe also this one
+        is_left_out = all(one is not alarm for one in self._waiting)
         self._remove(alarm)
         self._allowed -= 1
-        self.left_out = 0
+        self.left_out -= left_out + is_left_out
 
     def drop(self, alarm: Alarm) -> None:
         """Remove an alarm that `next` returned, because the target will never accept its message."""
@@ -304,7 +306,7 @@ class Sender(RetryingSender):
             raise
         self.sent += 1
         with self._changed:
-            self._queue.note_sent(alarm)
+            self._queue.note_sent(alarm, left_out)
         return 0.0
 
 

@@ -156,11 +156,16 @@ class Accumulator:
             self._n,
             self._missed,
             _where(has, self._least),
-            _where(has, [total / n if n else 0.0 for total, n in zip(self._sum, has, strict=True)]),
+            _where(has, [*map(_mean, has, self._sum, self._least, self._most)]),
             _where(has, self._most),
             unit,
             tuple(left_out),
         )
+
+
+def _mean(n: int, total: float, least: float, most: float) -> float:
+    """Return the mean of `n` values; it is between `least` and `most` even if `total` is rounded."""
+    return min(max(total / n, least), most) if n else 0.0
 
 
 def _where(has: Sequence[int], values: Sequence[float]) -> list[float | None]:
