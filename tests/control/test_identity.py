@@ -194,8 +194,8 @@ def test_a_setpoint_that_cannot_be_read_is_forgotten_once_the_drive_may_have_los
 ) -> None:
     with known(model) as (bus, drive, received):
         drive.set_frequency(10)
-        received.requests.clear()
         lose(bus, drive, received, monkeypatch)
+        received.requests.clear()
         with pytest.raises(
             WriteForbidden, match="cannot report its setpoint: call set_frequency before start"
         ):
