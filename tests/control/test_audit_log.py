@@ -6,6 +6,7 @@ import asyncio
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext, suppress
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,10 @@ import pytest
 from simulated_bus import SimulatedBus, one
 
 from multidrop.control.ramp import start_staggered
-from multidrop.control.records import read_audit, written_by
+from multidrop.control.records import noted_first, read_audit, written_by
 from multidrop.core import Completion, Exchange
 from multidrop.drive import Condition
-from multidrop.errors import BusError, DriveException, LineError, Unconfirmed
+from multidrop.errors import BusError, DriveException, LineError, Unconfirmed, WriteForbidden
 from multidrop.families import YD1000, InvtCHE
 from multidrop.families.invt_che import CHEControl
 from multidrop.transport.aside_log import flush
@@ -119,6 +120,54 @@ def test_a_write_that_is_interrupted_or_fails_is_recorded(
     line.bus.close()
     (record,) = list(read_audit(log))[1:]
     assert (record["write"], record["outcome"], bool(record["why"])) == (what, "unconfirmed", True)
+
+
+DELAYS: dict[str, Callable[[SimulatedBus, Any], object]] = {
+    "expired": lambda line, drive: line.sleep(5),
+    "cancelled": lambda line, drive: line.bus.stop_all(),
+    "silent": lambda line, drive: (line.sleep(60), setattr(line, "deafens", lambda request: True)),
+}
+WRITES: dict[str, tuple[str, Callable[[SimulatedBus, Any], object]]] = {
+    "start": ("control = FORWARD", lambda line, drive: drive.start()),
+    "raw": ("raw request 01 06 10 00 00 01 4C CA", lambda line, drive: drive.send_raw(6, 0x1000, b"\0\1")),
+    "broadcast": ("setpoint = 0.00 %", lambda line, drive: line.bus.broadcast(drive.setpoint, 0.0)),
+}
+
+
+@pytest.mark.parametrize(("kind", "delay"), [*product(WRITES, ["expired", "cancelled"]), ("start", "silent")])
+def test_a_write_that_is_recorded_first_and_then_not_sent_is_recorded_as_not_sent(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, kind: str, delay: str
+) -> None:
+    """Without the second record, the write would look as if it had been in flight when the process died."""
+    log = tmp_path / "audit.jsonl"
+    line, drive, _ = one(InvtCHE(1, maximum_frequency=50), audit=log)
+    drive.set_frequency(20)
+    what, act = WRITES[kind]
+    note_called = line.bus._records.note_called
+
+    def called(*details: Any) -> None:
+        note_called(*details)
+        DELAYS[delay](line, drive)
+
+    monkeypatch.setattr(line.bus._records, "note_called", called)
+    with noted_first(), pytest.raises(BusError) as failure:
+        act(line, drive)
+    line.bus.close()
+    first, second = (record for record in read_audit(log) if record["write"] == what)
+    assert (first["outcome"], second["outcome"]) == ("called", "not sent")
+    assert second["why"] == str(failure.value)
+    assert not {"sent", "why"} & first.keys()
+    assert "sent" not in second
+
+
+def test_a_write_that_the_eeprom_ledger_refuses_is_recorded_as_not_sent(tmp_path: Path) -> None:
+    log = tmp_path / "audit.jsonl"
+    line, drive, _ = one(YD1000(1), audit=log, ledger=tmp_path / "ledger")
+    drive.write(drive.acceleration_time, 5.0)
+    with noted_first(), pytest.raises(WriteForbidden):
+        drive.write(drive.acceleration_time, 6.0)
+    line.bus.close()
+    assert [record["outcome"] for record in read_audit(log)] == ["done", "called", "not sent"]
 
 
 Noted = list[tuple[str, str | None, str | None]]

@@ -55,6 +55,29 @@ def test_a_ramp_waits_between_its_steps_but_not_after_the_last() -> None:
     assert line.seconds - written_at[-1] < 0.5
 
 
+def test_the_small_delays_of_a_long_ramp_do_not_add_up_to_an_expiry(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, _ = one(YD1000(1))
+    drive.set_frequency(1)
+    monkeypatch.setattr(clock, "sleep", lambda seconds: line.sleep(seconds + 0.01))
+    ramp(drive, 60.0, rate=0.5, every=0.5)
+    assert steps(line)[-1] == 6000
+
+
+def test_a_ramp_ends_after_a_suspension_of_the_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, _ = one(YD1000(1))
+    drive.set_frequency(1)
+
+    def sleep(seconds: float) -> None:
+        line.sleep(seconds)
+        if len(line.written) == 4:
+            line.slept = 1.5
+
+    monkeypatch.setattr(clock, "sleep", sleep)
+    with pytest.raises(Expired):
+        ramp(drive, 60.0, rate=0.5, every=0.5)
+    assert len(line.written) == 4
+
+
 @table(
     ("drive", "before", "to", "rate", "counts"),
     [

@@ -120,9 +120,9 @@ class Call:
     """One call of a method that writes to a drive. `verb` is its name, such as "start"; "" for a plain write.
 
     The call sends no write after a stop was called, or when the call is late by more than `expiry` seconds.
-    Lateness is the time since the call, minus the time allowed for the call's own reads, writes and waits. So
-    nothing is sent late after the process was suspended or the computer slept. The first write is not sent
-    after `limit_ns` (CLOCK_BOOTTIME) either.
+    Lateness is the time since the call or its latest write, minus the time allowed for the call's own reads,
+    writes and waits. So nothing is sent late after the process was suspended or the computer slept. The first
+    write is not sent after `limit_ns` (CLOCK_BOOTTIME) either.
     """
 
     def __init__(
@@ -151,6 +151,15 @@ class Call:
         """
         expires_ns = self._due_ns + round((self.expiry + self.drive.least_interval) * 1e9)
         return expires_ns if self.sent else int(min(expires_ns, self._limit_ns))
+
+    @property
+    def late_ns(self) -> int:
+        """The call's present lateness in ns."""
+        return clock.boottime_ns() - self._due_ns
+
+    def excuse(self, late_ns: int) -> None:
+        """Subtract this time from the lateness. Otherwise the small delays of a long ramp would add up."""
+        self._due_ns += late_ns
 
     @contextmanager
     def step(self, seconds: float) -> Iterator[None]:

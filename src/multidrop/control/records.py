@@ -92,7 +92,8 @@ def read_audit(path: Path | str) -> Iterator[dict[str, Any]]:
     Each record has `time` (UTC), `port`, `drive`, `write` and `outcome`. If known, it also has `model`,
     `address`, `sent` (the newest frame), `frames` (the number of frames of a stop), `held` (the value that
     the drive holds), `why` (the reason for the outcome), and `by`, `way` and `id` (see `written_by`). The
-    outcome "called" means that the write is about to be sent, and "refused" that a gateway did not send it.
+    outcome "called" means that the write is about to be sent, "not sent" that it then was not sent, and
+    "refused" that a gateway did not send it.
     """
     with Path(path).open("rb") as lines:
         for line in lines:
@@ -199,6 +200,7 @@ def _spelt(given: object) -> str:
 
 
 CALLED = "called"  # outcome in the record of a write or a stop that is about to be sent
+UNSENT = "not sent"  # outcome in the record of a write after CALLED, if it was not sent
 REFUSED = "refused"  # outcome in the record of a write that was not sent
 CALLED_S = 0.05  # s; longest time that a stop waits until its audit record is written
 CLOSING_NS = 1_000_000_000  # longest time that closing the audit log waits for records of other threads
@@ -262,6 +264,15 @@ class WriteRecords:
         self._append(clock.utc_ns(), self._complete(record))
         if self.audit_trouble:
             raise OSError(f"{what} was not sent: the audit log cannot be written: {self.audit_trouble}")
+
+    def note_unsent(self, drive: Drive, request: Message, what: str, failure: BaseException) -> None:
+        """Within `noted_first`, record that a write was not sent although `note_called` has recorded it."""
+        if self.audit is None or not _noted_first.get():
+            return
+        record = self._record(drive, request, what, UNSENT, str(failure) or type(failure).__name__, None)
+        del record["sent"]
+        self._put(record, _log.log)
+        self.catch_up()
 
     def note_stops_called(self, verb: str, drives: Sequence[Drive]) -> None:
         """Record that these drives are about to be stopped, and wait up to CALLED_S for the record.

@@ -74,11 +74,16 @@ class Writer:
                     return Outcome(drive.name, register, asked, Effect.DONE, held=asked)
             # checked before counting: an unsent write must not be counted
             call.check(_in_words(register, asked))
-        self.records.note_called(drive, write_request(drive, register, raw), _in_words(register, asked))
-        if kept is not Kept.RAM:
-            self.records.count(drive, register, kept)
-        # checked again, because counting the write in the ledger may have taken long
-        self.identity_check.check(drive, call.look)
+        request, what = write_request(drive, register, raw), _in_words(register, asked)
+        self.records.note_called(drive, request, what)
+        try:
+            if kept is not Kept.RAM:
+                self.records.count(drive, register, kept)
+            # checked again, because counting the write in the ledger may have taken long
+            self.identity_check.check(drive, call.look)
+        except BaseException as failure:
+            self.records.note_unsent(drive, request, what, failure)
+            raise
         return self._send(drive, register, raw, call, 0.0, self.records.log)
 
     def insist(
@@ -135,7 +140,7 @@ class Writer:
         what = f"raw request {frame.hex(' ').upper()}"
         log = self.records.log
         self.records.note_called(drive, request, what)
-        with self._logged(drive, request, what, log):
+        with self._logged(drive, request, what, log, call):
             completion = self._carry_out(drive, request, what, call)
         try:
             reply = good_reply(drive, completion)
@@ -161,7 +166,7 @@ class Writer:
         if call:
             self.records.note_called(drive, request, what)
         expires_ns, permit = (call.expires_ns, call.permit) if call else (0, None)
-        with self._logged(drive, request, what, self.records.log_later):
+        with self._logged(drive, request, what, self.records.log_later, call):
             completion = self._exchanges.carry_out(
                 drive, request, expires_ns, insists=call is None, timeout=0.0, permit=permit
             )
@@ -185,7 +190,7 @@ class Writer:
         what = _in_words(register, asked)
         is_setpoint = register.name == drive.setpoint_name
         take_back = drive.begin_setpoint() if is_setpoint else lambda: None
-        with self._logged(drive, request, what, log):
+        with self._logged(drive, request, what, log, call):
             try:
                 completion = self._carry_out(drive, request, what, call, timeout)
             except Exception as failure:
@@ -212,7 +217,7 @@ class Writer:
     ) -> Completion:
         if call is None:
             return self._exchanges.carry_out(drive, request, insists=True, timeout=timeout)
-        expires_ns = call.expires_ns
+        expires_ns, late_ns = call.expires_ns, call.late_ns
         before, call.sent, call.is_confirmed = (call.sent, call.is_confirmed), what, False
         try:
             with call.look():
@@ -224,6 +229,7 @@ class Writer:
         if completion.result == Failure.EXPIRED:
             call.sent, call.is_confirmed = before
             raise call.unsent(what)
+        call.excuse(late_ns)
         return completion
 
     def _outcome(
@@ -272,12 +278,16 @@ class Writer:
             return self._exchanges.value(drive, step.register)
 
     @contextmanager
-    def _logged(self, drive: Drive, request: Message, what: str, log: Callable[..., None]) -> Iterator[None]:
-        """If the block fails and the write may have been sent, record the write as unconfirmed."""
+    def _logged(
+        self, drive: Drive, request: Message, what: str, log: Callable[..., None], call: Call | None
+    ) -> Iterator[None]:
+        """If the block fails, record the write as unconfirmed, or as not sent if that is certain."""
         try:
             yield
         except BaseException as failure:
             if _is_unsent(failure):
+                if call:
+                    self.records.note_unsent(drive, request, what, failure)
                 raise
             log(drive, request, what, Effect.UNCONFIRMED, str(failure) or type(failure).__name__)
             if isinstance(failure, (LineError, NotMaster)):
