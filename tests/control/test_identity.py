@@ -21,7 +21,7 @@ from multidrop.core import PAUSE_NS, Completion, Exchange, Failure, Framing, Mes
 from multidrop.drive import Script, write
 from multidrop.drive.register import Kept, reading, setting
 from multidrop.drive.verbs import verb
-from multidrop.errors import BusError, CheckAgain
+from multidrop.errors import BusError, CheckAgain, PortLost
 from multidrop.families import YD1000, DelixiModbus
 from multidrop.families.invt_che import CHEControl
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
@@ -605,3 +605,26 @@ def test_every_other_make_is_excluded_after_an_earlier_silence() -> None:
     with pytest.raises(WriteForbidden, match="it answers as a Powtran PI130"):
         drive.set_frequency(20)
     assert line.written == []
+
+
+def test_no_write_is_sent_on_a_port_that_was_reopened_while_the_write_waited_for_late_replies(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The drive may have been replaced, so its family must be checked again first."""
+    line, drive, sim = one(InvtCHE(1, maximum_frequency=50))
+    drive.set_frequency(20)
+    carry_out = line.carry_out
+
+    def late(exchange: Exchange, **times: Any) -> Completion:
+        is_start = exchange.request.start == 0x1000
+        return line._completion(int(Failure.LATE_ANSWER_DUE)) if is_start else carry_out(exchange, **times)
+
+    def sleep(seconds: float) -> None:
+        line.queue = object()
+        monkeypatch.setattr(line, "carry_out", carry_out)
+
+    monkeypatch.setattr(line, "carry_out", late)
+    monkeypatch.setattr(clock, "sleep", sleep)
+    with pytest.raises(PortLost, match="reopened while the write waited"):
+        drive.start()
+    assert not sim.motor.energised

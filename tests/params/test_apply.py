@@ -38,6 +38,7 @@ from multidrop import (
 from multidrop.control import Ledger, read_audit
 from multidrop.families.registry import shipped_family
 from multidrop.families.yd1000 import COMMAND
+from multidrop.params.apply import _Journal
 from multidrop.sim import MotorDrive, Simulator, Wire
 from multidrop.sim.drive import Reason, Refusal
 from multidrop.sim.memory import MemoryCell
@@ -275,6 +276,23 @@ def test_a_stop_during_apply_ends_the_apply(family: type[Drive]) -> None:
     sent = len(line.written)
     assert params.apply(drive, values).ok
     assert len(line.written) > sent
+
+
+def test_a_stop_while_the_journal_is_written_cancels_the_write(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, drive, _ = attached(YD1000(1), [])
+    note = _Journal.note
+
+    def stop_at_write(journal: _Journal, **record: Any) -> None:
+        note(journal, **record)
+        if "after" in record:
+            drive.stop()
+
+    with monkeypatch.context() as patch:
+        patch.setattr(_Journal, "note", stop_at_write)
+        done = params.apply(drive, {"0009": 200})
+    assert isinstance(done.failure, CancelledByStop)
+    assert {frame[6:11] for frame in line.written} == {"10 00"}  # the only writes are stops
+    assert "0009: 100 -> 200: not written" in params.apply(drive, {"0009": 200}).earlier
 
 
 def test_stop_while_the_plan_is_read_cancels_all_writes(monkeypatch: pytest.MonkeyPatch) -> None:

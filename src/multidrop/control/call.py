@@ -155,7 +155,7 @@ class Call:
     @property
     def late_ns(self) -> int:
         """The call's present lateness in ns."""
-        return clock.boottime_ns() - self._due_ns
+        return int(clock.boottime_ns() - self._due_ns)
 
     def excuse(self, late_ns: int) -> None:
         """Subtract this time from the lateness. Otherwise the small delays of a long ramp would add up."""

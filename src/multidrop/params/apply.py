@@ -16,7 +16,7 @@ from multidrop.control.eeprom_ledger import Ledger
 from multidrop.control.outcome import Effect, Outcome
 from multidrop.control.records import commissioning as commissioning_block
 from multidrop.drive.family import Drive
-from multidrop.errors import BusError, WriteForbidden
+from multidrop.errors import BusError, CancelledByStop, WriteForbidden
 from multidrop.iso_time import format_time
 from multidrop.params.plan import ApplyPlan, ParameterChange, check_stands, plan
 from multidrop.params.values import ParameterSet
@@ -113,10 +113,13 @@ def _write(change: ParameterChange, call: Call, result: Applied, journal: _Journ
         check_stands(drive)
         call.check(parameter.code)
         journal.note(code=parameter.code, before=change.before, after=change.after)
+        call.check(parameter.code)  # again, because the journal's disk may be slow
         outcome: Outcome = drive.try_write(parameter, parameter.decode(change.after))
     except (BusError, OSError) as failure:
         if isinstance(failure, WriteForbidden) and failure.is_budget:
             return _refused(change, failure, result, journal)
+        if isinstance(failure, CancelledByStop):
+            _note_outcome(change, "not written", result, journal)
         result.failure = failure
         return failure
     if outcome.effect is Effect.DONE:

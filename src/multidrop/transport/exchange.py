@@ -406,7 +406,11 @@ class Exchanges:
         if completion.result == Failure.LATE_ANSWER_DUE:
             wait_ns = completion.late_until_ns - clock.now_ns()
             wait_ns = min(wait_ns, expires_ns + 1 - clock.boottime_ns()) if expires_ns else wait_ns
+            port = self.line.queue
             clock.sleep(max(0, wait_ns) / 1e9)
+            if made.permit is not None and self.line.queue is not port:
+                # a write needs another check of the drive's family on the reopened port
+                raise PortLost(self.line.port, "it was reopened while the write waited for late replies")
             completion = self.peers.carry_out(drive, made, expires_ns=expires_ns)
         check_master(drive, completion)
         return completion

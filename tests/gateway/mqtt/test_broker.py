@@ -26,8 +26,10 @@ from peers import require_module
 
 from multidrop import Batch, InvtCHE, Plant
 from multidrop.control import CommandOutcome, CommandResult
+from multidrop.gateway.commands import Admit
 from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.http.rights import Caller, Right
+from multidrop.gateway.mqtt import broker_commands
 from multidrop.gateway.mqtt.broker import (
     MOST_UNDER_WAY,
     MOST_WAITING,
@@ -320,13 +322,17 @@ class HeldCommands:
     def __init__(self) -> None:
         self.go_on = asyncio.Event()
         self.begun: list[float] = []
+        self.deadlines: list[float] = []  # CLOCK_BOOTTIME, ns
         self.stopped: list[Sequence[str] | None] = []
 
     def stopped_ns(self, drive: str) -> None:
         return None
 
-    async def write(self, drive: str, register: str, value: float, caller: Caller) -> CommandResult:
+    async def write(
+        self, drive: str, register: str, value: float, caller: Caller, admit: Admit
+    ) -> CommandResult:
         self.begun.append(value)
+        self.deadlines.append(admit(register))
         await self.go_on.wait()
         return CommandResult(CommandOutcome.DONE, "done")
 
@@ -356,6 +362,19 @@ async def test_concurrent_commands_from_a_broker_are_limited_and_stops_are_not()
     orders.write("pump-1", "setpoint", 99.0, NOW_MS)
     await asyncio.gather(*asyncio.all_tasks() - {asyncio.current_task()})
     assert commands.begun[-1] == 99.0
+
+
+async def test_a_command_is_not_sent_after_its_age_limit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The process may be suspended after the command's age was checked."""
+    monkeypatch.setattr(broker_commands, "boottime_ns", lambda: 100 * 10**9)
+    commands: Any = HeldCommands()
+    orders = BrokerCommands(commands, CALLER, lambda: NOW_MS, lambda *given: None)
+    orders.write("pump-1", "setpoint", 1.0, NOW_MS - 3_000)
+    commands.go_on.set()
+    await asyncio.gather(*asyncio.all_tasks() - {asyncio.current_task()})
+    assert commands.deadlines == [102 * 10**9]
 
 
 # ---- MQTT through the listener of nats-server: retained state, the last will, commands, and Sparkplug ----

@@ -58,8 +58,9 @@ class BrokerCommands:
         Raises ValueError for an invalid id.
         """
         what, caller = f"{register} = {value!r}", self._caller.commanding(given_id)
-        if self._is_taken(drive, what, (drive, register, value, time_ms), time_ms, caller):
-            work = self._commands.write(drive, register, value, caller)
+        until_ns = self._admit(drive, what, (drive, register, value, time_ms), time_ms, caller)
+        if until_ns is not None:
+            work = self._commands.write(drive, register, value, caller, lambda what: until_ns)
             self._begin(self._counted(self._do(drive, what, caller, work)))
 
     def act(
@@ -70,8 +71,9 @@ class BrokerCommands:
         Raises ValueError for an invalid id.
         """
         caller = self._caller.commanding(given_id)
-        if self._is_taken(drive, verb, (drive, verb, repr(options), time_ms), time_ms, caller):
-            work = self._commands.act(drive, verb, options, caller)
+        until_ns = self._admit(drive, verb, (drive, verb, repr(options), time_ms), time_ms, caller)
+        if until_ns is not None:
+            work = self._commands.act(drive, verb, options, caller, lambda what: until_ns)
             self._begin(self._counted(self._do(drive, verb, caller, work)))
 
     def refuse(self, drive: str, what: str, why: str, given_id: object = None) -> None:
@@ -90,14 +92,19 @@ class BrokerCommands:
             return False
         return (boottime_ns() - at_ns) // 1_000_000 <= age_ms + MOST_AHEAD_MS
 
-    def _is_taken(self, drive: str, what: str, command: object, time_ms: int, caller: Caller) -> bool:
-        why = self._why_not(drive, command, self._utc_ms() - time_ms)
+    def _admit(self, drive: str, what: str, command: object, time_ms: int, caller: Caller) -> float | None:
+        """Return the deadline for sending a command (CLOCK_BOOTTIME, ns).
+
+        If the command must not be sent, report why, and return None.
+        """
+        age_ms = self._utc_ms() - time_ms
+        why = self._why_not(drive, command, age_ms)
         if why:
             self.refuse(drive, what, why, caller.command)
-            return False
+            return None
         self._came.append(command)
         self._under_way += 1  # counted before the task starts, because many commands may arrive at once
-        return True
+        return boottime_ns() + (MOST_AGE_MS - age_ms) * 1_000_000
 
     def _why_not(self, drive: str, command: object, age_ms: int) -> str:
         """Return why a command with this age must not be carried out; "" if it may be carried out."""
