@@ -259,7 +259,7 @@ struct md_completion {
     int64_t sent_ns;           /* when the first byte of the request left; 0: never */
     int64_t utc_ahead_ns;      /* UTC - CLOCK_MONOTONIC at sent_ns; 0: unknown */
     int64_t first_ns, last_ns; /* arrival of the first and the last byte after the request */
-    int64_t late_until_ns;     /* of an urgent exchange: the drive's late_until_ns at the client's call */
+    int64_t late_until_ns;     /* urgent exchange: the drive's late_until_ns when the client called */
     uint32_t stale;            /* bytes discarded before the request: late replies, noise */
     uint32_t skipped;          /* bytes after the request that are not part of the reply */
     uint16_t raw_len;

@@ -135,7 +135,7 @@ static struct md_columns *begin_chunk(struct md_row_queue *queue)
     return chunk;
 }
 
-/* Prefetch the memory of the exchange's next rows, because unlocking waits for all writes. */
+/* Prefetch the memory of the next exchange's rows, because unlocking waits until all rows are written. */
 static void look_ahead(const struct md_columns *chunk, size_t count)
 {
     enum { CACHE_LINE = 64, NUMBERS = CACHE_LINE / sizeof(int64_t) };
