@@ -72,8 +72,8 @@ SECOND: dict[tuple[str, str], set[str]] = {
     ("start", "?"): {"yd1000"},  # a trip freezes its status
     ("start", "x"): {"yd1000"},
     ("stop", "x"): {"erman-er-g-220", "innovert-ibd", "delixi-modbus", "yd1000"},  # no status of standstill
-    ("reset_fault", "?"): {"invt-che", "delixi-native"},  # the reset is one pulse
-    ("reset_fault", "ok"): {"yaskawa-a1000", "yd1000"},  # the reset is a pulse and further control words
+    ("reset_fault", "?"): {"invt-che", "delixi-native"},  # one write resets the fault
+    ("reset_fault", "ok"): {"yaskawa-a1000", "yd1000"},  # a reset takes several control words
 }
 HEAD, *ROWS = [line.split() for line in TABLE.strip().splitlines()]
 REPEATED = (("fresh", "stop"), ("tripped", "stop"), ("running", "coast"), ("running", "set_frequency"))

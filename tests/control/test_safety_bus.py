@@ -158,7 +158,7 @@ def test_an_unidentified_innovert_ibd_needs_confirmed_for_writes() -> None:
             assert line.written == []
 
 
-def test_try_write_reports_done_taken_as_or_unconfirmed() -> None:
+def test_try_write_returns_how_each_write_ended() -> None:
     line, drive, _ = one(InnovertIBD(1))
     outcome = drive.try_write(drive.acceleration_time, 20.0)
     assert (outcome.effect, outcome.held) == (Effect.DONE, 20.0)

@@ -247,7 +247,7 @@ def test_codes_of_a_column_are_converted_to_names() -> None:
     assert found == ["вентилятор", "pump-1", "", "вентилятор"]
 
 
-def test_codes_of_names_added_later_are_converted_too() -> None:
+def test_names_added_later_appear_in_the_text_column() -> None:
     names = Names()
     numbers = [names.number(name) for name in ("pump", "fan", "pump")]
     spell(memoryview(array("H", numbers)), names)

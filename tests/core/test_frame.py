@@ -81,13 +81,13 @@ def test_printed_frames_are_parsed_to_their_documented_meaning() -> None:
         assert parse(printed, printed.frame) == (len(printed.frame), printed.says)
 
 
-def test_a_request_is_built_as_printed() -> None:
+def test_a_request_is_built_as_documented() -> None:
     for printed in GOOD_REQUESTS:
         assert isinstance(printed.says, Message)
         assert build_request(printed.framing, printed.says) == printed.frame
 
 
-def test_a_reply_is_built_as_printed() -> None:
+def test_a_reply_is_built_as_documented() -> None:
     for printed in (reply for reply in GOOD_REPLIES if reply.text != MISPRINTED):
         assert isinstance(printed.says, Message)
         assert build_reply(printed.framing, printed.says) == printed.frame
@@ -216,7 +216,7 @@ WRONG = [
     [each[1:] for each in WRONG],
     ids=[each[0] for each in WRONG],
 )
-def test_a_wrong_reply_ends_with_its_fault_and_without_data(
+def test_the_result_of_a_wrong_reply_has_a_fault_and_no_data(
     framing: Framing, request_: Message, received: bytes, reason: FrameFault
 ) -> None:
     assert parse_reply(framing, received, request_) == (reason, None)

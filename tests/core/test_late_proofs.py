@@ -1,6 +1,6 @@
-"""If late replies are possible, a request whose reply would be ambiguous waits for the reply to a proof.
+"""If late replies are possible, a request whose reply would be ambiguous waits for the reply to a check read.
 
-A proof is a read whose reply no late reply can resemble.
+A check read (`proof` in the code) is a read whose reply no late reply can resemble.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ AGAIN = Message(1, 6, 9, data=words(1))
 
 @pytest.fixture
 def proof(line: LineDriver, drive: Peer) -> Exchange:
-    """Let READ time out, and the time for its late reply pass. Return the drive's proof, a longer read."""
+    """Let READ time out, and the time for its late reply pass. Return the check read, a longer one."""
     found = exchange(LONGER, drive)
     drive.prove_by([found])
     time_out(line, drive, READ)
@@ -52,9 +52,9 @@ def test_a_write_waits_for_the_reply_to_an_earlier_write(line: LineDriver, drive
 
 
 @pytest.mark.parametrize("late", [0, 1])
-def test_an_answered_proof_ends_the_wait(line: LineDriver, drive: Peer, proof: Exchange, late: int) -> None:
+def test_check_read_reply_ends_the_wait(line: LineDriver, drive: Peer, proof: Exchange, late: int) -> None:
     line.send(proof)
-    for _ in range(late):  # a late reply before that of the proof is skipped
+    for _ in range(late):  # a late reply before that of the check read is skipped
         line.receive(reply(1111))
         assert line.listens
     assert drive.counters().late == late
@@ -63,7 +63,7 @@ def test_an_answered_proof_ends_the_wait(line: LineDriver, drive: Peer, proof: E
     assert line.data_after(reply(2222)) == words(2222)
 
 
-def test_an_unanswered_proof_leaves_a_late_reply_due(line: LineDriver, drive: Peer, proof: Exchange) -> None:
+def test_an_unanswered_check_read_prolongs_the_wait(line: LineDriver, drive: Peer, proof: Exchange) -> None:
     line.send(proof)
     line.wait_until_done()
     assert line.completion.result == Failure.NO_REPLY
@@ -72,7 +72,7 @@ def test_an_unanswered_proof_leaves_a_late_reply_due(line: LineDriver, drive: Pe
 
 
 def ask_in_vain(line: LineDriver, drive: Peer, proof: Exchange) -> None:
-    """Let the drive answer another request, but not READ and not the proof."""
+    """Let the drive answer another request, but neither READ nor the check read."""
     ask(line, drive, Message(1, 4, 50, 1))
     line.receive(build_reply(Framing.RTU, Message(1, 4, data=words(2222))))
     assert line.completion.result > 0
@@ -83,7 +83,7 @@ def ask_in_vain(line: LineDriver, drive: Peer, proof: Exchange) -> None:
     line.now = drive.late_until_ns + MS
 
 
-def test_a_proof_that_is_never_answered_is_dropped(line: LineDriver, drive: Peer, proof: Exchange) -> None:
+def test_requests_go_on_if_check_reads_get_no_reply(line: LineDriver, drive: Peer, proof: Exchange) -> None:
     """Some devices do not reply to reads of registers that they do not have."""
     ask_in_vain(line, drive, proof)
     assert is_barred(line, drive, OTHER)
@@ -92,7 +92,7 @@ def test_a_proof_that_is_never_answered_is_dropped(line: LineDriver, drive: Peer
 
 
 @pytest.mark.parametrize("is_late", [True, False])
-def test_a_proof_answered_once_is_kept(line: LineDriver, drive: Peer, proof: Exchange, is_late: bool) -> None:
+def test_answered_check_read_is_kept(line: LineDriver, drive: Peer, proof: Exchange, is_late: bool) -> None:
     if is_late:
         ask_in_vain(line, drive, proof)
     else:
@@ -103,7 +103,7 @@ def test_a_proof_answered_once_is_kept(line: LineDriver, drive: Peer, proof: Exc
     assert is_barred(line, drive, OTHER)
 
 
-def test_a_drive_that_never_answers_keeps_its_proofs(line: LineDriver, drive: Peer, proof: Exchange) -> None:
+def test_a_silent_drive_keeps_its_check_reads(line: LineDriver, drive: Peer, proof: Exchange) -> None:
     for _ in range(3):
         line.send(proof)
         line.wait_until_done()
@@ -112,7 +112,7 @@ def test_a_drive_that_never_answers_keeps_its_proofs(line: LineDriver, drive: Pe
 
 
 @pytest.mark.usefixtures("proof")
-def test_a_stop_does_not_wait_for_the_reply_to_a_proof(line: LineDriver, drive: Peer) -> None:
+def test_a_stop_does_not_wait_for_the_reply_to_a_check_read(line: LineDriver, drive: Peer) -> None:
     time_out(line, drive, WRITE)
     stop = exchange(AGAIN, drive)
     stop.c.insists = 1
@@ -186,7 +186,7 @@ def test_a_reply_is_in_doubt_if_it_may_answer_another_request(line: LineDriver, 
 
 
 @pytest.mark.usefixtures("proof")
-def test_no_reply_is_in_doubt_after_an_answered_proof(line: LineDriver, drive: Peer, proof: Exchange) -> None:
+def test_no_reply_is_in_doubt_after_a_check_read(line: LineDriver, drive: Peer, proof: Exchange) -> None:
     line.send(proof)
     line.receive(PROOF_REPLY)
     assert has_sure_reply(line, drive)
@@ -194,7 +194,7 @@ def test_no_reply_is_in_doubt_after_an_answered_proof(line: LineDriver, drive: P
 
 @pytest.fixture
 def first(drive: Peer) -> Exchange:
-    """Return the proof of a drive whose first reply may be to another process's READ."""
+    """Return the check read of a drive whose first reply may be to another process's READ."""
     found = exchange(LONGER, drive)
     drive.prove_by([found, exchange(Message(1, 3, 0, 3), drive)])
     drive.doubt_first_reply()
@@ -205,7 +205,7 @@ def is_in_doubt(line: LineDriver) -> bool:
     return line.want == "done" and line.completion.result == Failure.LATE_ANSWER_DUE
 
 
-def test_a_proof_ends_the_doubt_about_the_first_reply(line: LineDriver, drive: Peer, first: Exchange) -> None:
+def test_a_check_read_ends_doubt_about_first_reply(line: LineDriver, drive: Peer, first: Exchange) -> None:
     ask(line, drive, READ)
     line.receive(reply(7777))  # the reply to the other process
     assert is_in_doubt(line)
@@ -246,7 +246,7 @@ def test_a_stop_accepts_a_first_reply_that_is_in_doubt(line: LineDriver, drive: 
         assert line.completion.result > 0
 
 
-def test_the_first_reply_is_accepted_if_the_drive_has_no_proofs(line: LineDriver, drive: Peer) -> None:
+def test_the_first_reply_is_accepted_if_the_drive_has_no_check_reads(line: LineDriver, drive: Peer) -> None:
     drive.doubt_first_reply()
     ask(line, drive, READ)
     assert line.data_after(reply(1111)) == words(1111)

@@ -18,7 +18,7 @@ from multidrop.core import Exchange, Framing, Message, Peer, build_reply
 
 DRAWING = Path(__file__).parents[2] / "docs" / "diagrams" / "line_states.py"
 READ, WRITE, BROADCAST = Message(1, 3, 0, 2), Message(1, 6, 2, data=words(7)), Message(0, 6, 2, data=words(7))
-MOST_EVENTS = 2  # highest number of events in one call: a broadcast that is sent also ends
+MOST_EVENTS = 2  # events in one call: for example, a broadcast is sent and ends
 
 
 def numbers(kind: str) -> dict[str, int]:

@@ -77,14 +77,14 @@ TABLE = """
 """
 
 
-def test_che_registers_equal_the_table_typed_from_the_che100_manual() -> None:
+def test_invt_che_registers_equal_the_table_typed_from_the_che100_manual() -> None:
     assert rows(InvtCHE) == typed(TABLE)
     assert all(register.outside for register in InvtCHE.registers.values())
     signed = {name for name, each in InvtCHE.registers.items() if each.number_format is NumberFormat.I16}
     assert signed == {"setpoint", "output_power", "output_torque"}
 
 
-def test_che_scales_on_which_sources_differ_are_not_declared() -> None:
+def test_invt_che_scales_on_which_sources_differ_are_not_declared() -> None:
     """By an owner's log of a CHF100A, 3006H is in 0.01 kW. By the Goodrive300L manual, it is in 0.1 %."""
     for register, raw in ((InvtCHE.output_power, 262), (InvtCHE.dc_bus_voltage, 5370)):
         assert register.value_unit == "raw count"
@@ -92,7 +92,7 @@ def test_che_scales_on_which_sources_differ_are_not_declared() -> None:
         assert "CHF100A" in register.note
 
 
-def test_che_control_and_status_numbers_have_the_documented_names() -> None:
+def test_invt_che_control_and_status_numbers_have_the_documented_names() -> None:
     assert [(each.value, each.name) for each in CHEControl] == [
         (1, "FORWARD"),
         (2, "REVERSE"),
@@ -109,7 +109,7 @@ def test_che_control_and_status_numbers_have_the_documented_names() -> None:
     assert CHEFault(10) is CHEFault.UV_UNDERVOLTAGE
 
 
-def test_che_line_settings_and_limits_are_those_of_the_manual() -> None:
+def test_invt_che_line_settings_and_limits_are_those_of_the_manual() -> None:
     assert str(InvtCHE(247).settings) == "9600 8N1"
     assert InvtCHE.most_registers == {HOLDING: 16}
     assert set(InvtCHE.exceptions) == {1, 2, 3, 6, 0x10, 0x11, 0x12, 0x13}
@@ -117,7 +117,7 @@ def test_che_line_settings_and_limits_are_those_of_the_manual() -> None:
     assert "PC.05" in InvtCHE.watchdog
 
 
-def test_che_start_sends_the_control_word_of_its_direction() -> None:
+def test_invt_che_start_sends_the_control_word_of_its_direction() -> None:
     wire = Wire(InvtCHE(1), STANDBY, turns=TURNS)
     wire.drive.start(Direction.FORWARD)
     wire.drive.start()
@@ -126,7 +126,7 @@ def test_che_start_sends_the_control_word_of_its_direction() -> None:
     assert wire.sent[2].startswith("01 06 10 00 00 02")
 
 
-def test_che_start_without_a_direction_keeps_a_running_motors_direction() -> None:
+def test_invt_che_start_without_a_direction_keeps_a_running_motors_direction() -> None:
     wire = Wire(InvtCHE(1), {"status": CHEStatus.REVERSE, "setpoint": 40.0})
     wire.drive.start()
     assert [each[:17] for each in wire.sent] == ["01 06 10 00 00 02"]
@@ -146,7 +146,7 @@ UNDOCUMENTED = "has 0005H at 1001H, a state that the manual does not explain"
     ],
 )
 @table("direction", [None, *Direction])
-def test_che_start_and_jog_are_refused_if_the_motor_may_turn(
+def test_invt_che_start_and_jog_are_refused_if_the_motor_may_turn(
     verb: str, status: int, sentence: str, direction: Direction | None
 ) -> None:
     wire = Wire(InvtCHE(1), {**STANDBY, "status": status})
@@ -155,14 +155,14 @@ def test_che_start_and_jog_are_refused_if_the_motor_may_turn(
     assert wire.sent == []
 
 
-def test_che_stop_waits_for_the_state_standby() -> None:
+def test_invt_che_stop_waits_for_the_state_standby() -> None:
     wire = Wire(InvtCHE(1), {"status": [CHEStatus.FORWARD, CHEStatus.FORWARD, CHEStatus.STANDBY]})
     wire.drive.stop()
     assert wire.sent == [STOP, STOP_JOG]
     assert wire.reads == ["status"] * 3
 
 
-def test_che_stop_jog_is_sent_at_once_if_a_jog_continues_after_a_stop() -> None:
+def test_invt_che_stop_jog_is_sent_at_once_if_a_jog_continues_after_a_stop() -> None:
     """STOP_JOG is not delayed until `stop_time` has passed."""
     wire = Wire(InvtCHE(1), {"status": CHEStatus.FORWARD}, turns={STOP_JOG: {"status": CHEStatus.STANDBY}})
     wire.drive.stop()
@@ -174,14 +174,14 @@ def test_che_stop_jog_is_sent_at_once_if_a_jog_continues_after_a_stop() -> None:
     assert wire.sent == [STOP, STOP_JOG]
 
 
-def test_che_coast_is_unconfirmed_while_the_motor_turns() -> None:
+def test_invt_che_coast_is_unconfirmed_while_the_motor_turns() -> None:
     wire = Wire(InvtCHE(1, stop_time=20), {"status": CHEStatus.FORWARD})
     with pytest.raises(Unconfirmed, match="20 s"):
         wire.drive.coast()
     assert wire.sent == [frame(InvtCHE(1), InvtCHE.control, CHEControl.COAST)]
 
 
-def test_che_stop_jog_is_sent_after_a_refused_stop() -> None:
+def test_invt_che_stop_jog_is_sent_after_a_refused_stop() -> None:
     refusal = DriveException("drive", 0x12, "")
     turns = {STOP_JOG: {"status": CHEStatus.STANDBY}}
     wire = Wire(InvtCHE(1), {"status": CHEStatus.FORWARD}, {STOP: [refusal] * 3}, turns)
@@ -189,7 +189,7 @@ def test_che_stop_jog_is_sent_after_a_refused_stop() -> None:
     assert wire.sent == [STOP] * 3 + [STOP_JOG]
 
 
-def test_che_stop_jog_is_sent_after_an_unconfirmed_stop() -> None:
+def test_invt_che_stop_jog_is_sent_after_an_unconfirmed_stop() -> None:
     """A drive whose replies are lost may still receive the stop. The stop may not end a jog."""
     lost = Unconfirmed("drive", "control = STOP", "no reply")
     for of_a_jog in ([], [lost] * 3):  # STOP_JOG is sent only once, because the caller repeats the whole stop
@@ -204,14 +204,14 @@ def test_che_stop_jog_is_sent_after_an_unconfirmed_stop() -> None:
     [NoReply("drive"), BadReply("drive", "checksum", b""), DriveException("drive", 6, "busy")],
     ids=lambda unseen: type(unseen).__name__,
 )
-def test_che_stop_jog_is_sent_if_the_state_after_a_stop_is_unknown(unseen: BusError) -> None:
+def test_invt_che_stop_jog_is_sent_if_the_state_after_a_stop_is_unknown(unseen: BusError) -> None:
     wire = Wire(InvtCHE(1), {"status": unseen})
     with pytest.raises(type(unseen)):
         wire.drive.stop()
     assert wire.sent == [STOP, STOP_JOG]
 
 
-def test_che_stop_jog_is_not_sent_to_a_drive_of_another_make() -> None:
+def test_invt_che_stop_jog_is_not_sent_to_a_drive_of_another_make() -> None:
     wire = Wire(
         InvtCHE(1), {"status": CHEStatus.FORWARD}, {STOP: [WriteForbidden("another family is there")]}
     )
@@ -220,7 +220,7 @@ def test_che_stop_jog_is_not_sent_to_a_drive_of_another_make() -> None:
     assert wire.sent == [STOP]
 
 
-def test_che_state_is_read_even_after_a_refused_stop_jog() -> None:
+def test_invt_che_state_is_read_even_after_a_refused_stop_jog() -> None:
     refusal = DriveException("drive", 0x12, "")
     says = {"status": [CHEStatus.FORWARD] * 4 + [CHEStatus.STANDBY]}
     wire = Wire(InvtCHE(1), says, {STOP_JOG: [refusal] * 3})
@@ -228,7 +228,7 @@ def test_che_state_is_read_even_after_a_refused_stop_jog() -> None:
     assert wire.sent == [STOP] + [STOP_JOG] * 3
 
 
-def test_che_stop_that_is_refused_at_rest_counts_as_done() -> None:
+def test_invt_che_stop_that_is_refused_at_rest_counts_as_done() -> None:
     refusal = DriveException("drive", 1, "")
     wire = Wire(InvtCHE(1), {"status": CHEStatus.FAULT}, {STOP: [refusal] * 3})
     wire.drive.stop()
@@ -254,7 +254,7 @@ def test_invt_che_coast_and_reset_send_the_documented_words() -> None:
     assert wire.sent == [RESET]
 
 
-def test_che_start_in_a_fault_is_refused_until_a_reset() -> None:
+def test_invt_che_start_in_a_fault_is_refused_until_a_reset() -> None:
     says = {**STANDBY, "status": CHEStatus.FAULT, "fault": CHEFault.OC1_OVERCURRENT_ACCELERATING}
     wire = Wire(InvtCHE(1), says, turns=TURNS)
     for verb in (wire.drive.start, wire.drive.jog):
@@ -272,7 +272,7 @@ def test_che_start_in_a_fault_is_refused_until_a_reset() -> None:
 
 
 @table(("name", "word"), [("start", CHEControl.FORWARD), ("jog", CHEControl.JOG_FORWARD)])
-def test_che_trip_during_a_start_is_reported(name: str, word: CHEControl) -> None:
+def test_invt_che_trip_during_a_start_is_reported(name: str, word: CHEControl) -> None:
     tripped = {"status": CHEStatus.FAULT, "fault": CHEFault.OC1_OVERCURRENT_ACCELERATING}
     sent = frame(InvtCHE(1), InvtCHE.control, word)
     wire = Wire(InvtCHE(1), STANDBY, turns={sent: tripped})
@@ -281,7 +281,7 @@ def test_che_trip_during_a_start_is_reported(name: str, word: CHEControl) -> Non
     assert wire.sent == [sent]
 
 
-def test_che_setpoint_is_written_in_percent_of_the_maximum_frequency() -> None:
+def test_invt_che_setpoint_is_written_in_percent_of_the_maximum_frequency() -> None:
     wire = Wire(InvtCHE(1, maximum_frequency=80))
     wire.drive.set_frequency(40)
     wire.drive.set_frequency(0)
@@ -298,7 +298,7 @@ def test_che_setpoint_is_written_in_percent_of_the_maximum_frequency() -> None:
 
 
 @table(("most", "hz", "count"), [(50, 20.03, 4006), (30, 10, 3333), (60, 40, 6667), (60, 60, 10000)])
-def test_che_setpoint_is_rounded_to_a_hundredth_of_a_percent(most: float, hz: float, count: int) -> None:
+def test_invt_che_setpoint_is_rounded_to_a_hundredth_of_a_percent(most: float, hz: float, count: int) -> None:
     line, drive, _ = one(InvtCHE(1, maximum_frequency=most))
     drive.set_frequency(hz)
     (written,) = line.written
@@ -320,18 +320,18 @@ def test_che_setpoint_is_rounded_to_a_hundredth_of_a_percent(most: float, hz: fl
         ({"status": 9}, State(Condition.UNKNOWN, note="1001H = 9 is not explained")),
     ],
 )
-def test_che_status_word_decodes_to_the_state(says: dict[str, object], state: State) -> None:
+def test_invt_che_status_word_decodes_to_the_state(says: dict[str, object], state: State) -> None:
     assert Wire(InvtCHE(1), says).drive.state() == state
 
 
-def test_che_identify_refuses_other_makes() -> None:
+def test_invt_che_identify_refuses_other_makes() -> None:
     for device in (0x0101, 0x0102):
         Wire(InvtCHE(1), {"device": InvtCHE.device.decode(device)}).drive.identify()
     with pytest.raises(WriteForbidden, match="010AH"):
         Wire(InvtCHE(1), {"device": InvtCHE.device.decode(0x010A)}).drive.identify()
 
 
-def test_che_parameter_of_a_user_is_written_to_its_ram_address() -> None:
+def test_invt_che_parameter_of_a_user_is_written_to_its_ram_address() -> None:
     class Mine(InvtCHE):
         """A user's family with parameters from the drive's manual."""
 
@@ -348,7 +348,7 @@ def test_che_parameter_of_a_user_is_written_to_its_ram_address() -> None:
             parameter(wrong)
 
 
-def test_che_stored_parameter_is_written_to_eeprom_and_counted(tmp_path: Path) -> None:
+def test_invt_che_stored_parameter_is_written_to_eeprom_and_counted(tmp_path: Path) -> None:
     """The frame is the example of section 11.6.2, which does not explain its value."""
 
     class Mine(InvtCHE):
@@ -372,7 +372,7 @@ def test_che_stored_parameter_is_written_to_eeprom_and_counted(tmp_path: Path) -
     assert sim.counters.eeprom_writes == {"jump": 1}
 
 
-def test_che_start_after_a_jog_requires_a_stop() -> None:
+def test_invt_che_start_after_a_jog_requires_a_stop() -> None:
     jog = checksums.rtu("01 06 10 00 00 03").hex(" ").upper()
     wire = Wire(
         InvtCHE(1),

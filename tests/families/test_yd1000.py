@@ -260,7 +260,7 @@ def test_yd1000_line_settings_and_limits_are_those_of_the_document() -> None:
         (YD1000Control(0), "01 06 10 00 00 00 8D 0A"),
     ],
 )
-def test_yd1000_control_words_without_bit_14_are_sent_as_printed(word: YD1000Control, printed: str) -> None:
+def test_yd1000_words_without_bit_14_are_sent_as_documented(word: YD1000Control, printed: str) -> None:
     assert frame(YD1000(1), YD1000.control, word) == printed
 
 
@@ -558,7 +558,7 @@ def test_yd1000_panel_can_run_the_motor_after_release_control() -> None:
         one(DelixiModbus(1))[1].release_control()
 
 
-def test_yd1000_setpoint_is_written_to_1001h_and_limited_by_fh() -> None:
+def test_yd1000_setpoint_is_written_to_1001h_and_limited() -> None:
     wire = Wire(YD1000(1), STANDING)
     wire.drive.set_frequency(80)
     assert wire.sent == [EIGHTY]

@@ -300,7 +300,7 @@ def test_requests_are_decoded_as_by_a_libmodbus_server(libmodbus: Libmodbus) -> 
         ours = message if isinstance(message, str) else expected(used, message)
         if isinstance(theirs, Understood) and isinstance(message, Message) and theirs.reply:
             used, _ = parse_reply(RTU, theirs.reply, message)
-            assert used == len(theirs.reply), said  # we accept libmodbus's reply
+            assert used == len(theirs.reply), said  # multidrop accepts libmodbus's reply
             theirs = replace(theirs, reply=theirs.reply[1:-2])
             answers += 1
         differences += compare(said, ours, theirs)

@@ -143,7 +143,10 @@ def test_an_abort_stops_all_drives_and_says_why(kind: str, tmp_path: Path) -> No
         happened: list[bool] = []
 
         def happen(rows: object) -> None:
-            quiet = {"fault": "steps 1", "silence": "hold"}  # otherwise a command would fail first
+            quiet = {
+                "fault": "steps 1",
+                "silence": "hold",
+            }  # else a command fails first
             is_due = test.phase == quiet.get(kind, test.phase)
             if sims[0].motor.energised and is_due and not happened:
                 happened.append(True)

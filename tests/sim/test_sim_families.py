@@ -70,7 +70,7 @@ def erman() -> Bench:
     return Bench(ErmanERG220(1))
 
 
-def test_simulated_erman_control_registers_are_read_as_printed(erman: Bench) -> None:
+def test_simulated_erman_control_registers_are_read_as_documented(erman: Bench) -> None:
     erman.sim["control_register"] = 0x0100
     erman.sim["frequency"] = 50.0
     erman.sim["maximum_frequency"] = 50.0
@@ -78,7 +78,7 @@ def test_simulated_erman_control_registers_are_read_as_printed(erman: Bench) -> 
     assert erman.exchange("01 03 00 01 00 04 15 C9") == "01 03 08 01 00 01 F4 01 F4 00 32 25 C4"
 
 
-def test_simulated_erman_state_registers_are_read_as_printed(erman: Bench) -> None:
+def test_simulated_erman_state_registers_are_read_as_documented(erman: Bench) -> None:
     erman.sim["output_frequency"] = 50.0
     erman.sim["output_current"] = 21.4
     erman.sim["dc_bus_voltage"] = 562
@@ -92,7 +92,7 @@ def test_simulated_erman_writes_several_registers_with_function_10h(erman: Bench
     assert erman.exchange("01 0F 00 00 00 09 02 01 01 25 2C") == "01 0F 00 00 00 09 95 CD"
 
 
-def test_simulated_erman_coils_are_read_as_printed(erman: Bench) -> None:
+def test_simulated_erman_coils_are_read_as_documented(erman: Bench) -> None:
     assert erman.exchange("01 01 00 00 00 0C 3C 0F")[:11] == "01 01 02 00"
     erman.exchange("01 05 00 00 FF 00 8C 3A")
     assert erman.exchange("01 01 00 00 00 0C 3C 0F")[:14] == "01 01 02 01 00"
@@ -111,7 +111,7 @@ def test_simulated_erman_coils_are_read_as_printed(erman: Bench) -> None:
         (Message(1, 0x10, 0x58, 2, b"\x00\x00\x00\x00"), "01 90 03 0C 01"),
     ],
 )
-def test_simulated_erman_refuses_addresses_as_printed(erman: Bench, request_: Message, reply: str) -> None:
+def test_simulated_erman_refuses_addresses_as_documented(erman: Bench, request_: Message, reply: str) -> None:
     assert erman.send(build_request(Framing.RTU, request_)) == bytes.fromhex(reply)
 
 
@@ -397,7 +397,7 @@ def delixi() -> Bench:
     return Bench(DelixiModbus(1))
 
 
-def test_simulated_delixi_output_frequency_is_read_as_printed(delixi: Bench) -> None:
+def test_simulated_delixi_output_frequency_is_read_as_documented(delixi: Bench) -> None:
     delixi.exchange("01 06 00 02 13 88 25 5C")
     delixi.exchange("01 06 20 00 00 12 02 07")
     delixi.wait(60)
@@ -407,7 +407,7 @@ def test_simulated_delixi_output_frequency_is_read_as_printed(delixi: Bench) -> 
     assert delixi.read(3, 0x020D) == [9]
 
 
-def test_simulated_delixi_output_frequency_is_read_in_ascii_as_printed() -> None:
+def test_simulated_delixi_output_frequency_is_read_in_ascii_as_documented() -> None:
     delixi = Bench(DelixiModbus(1, framing=Framing.ASCII))
     delixi.sim["output_frequency"] = 50
     assert delixi.exchange(":010301F4000106") == ":01030213885F"
