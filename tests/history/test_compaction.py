@@ -246,6 +246,19 @@ def test_the_readable_part_of_a_damaged_segment_is_read(
         assert sorted(rows_in(history)) == sorted(before)
 
 
+def test_reports_of_many_damaged_segments_fit_into_a_pipe(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The recorder reads these reports only after the process has ended, and a pipe holds 64 KiB."""
+    for number in range(1, 401):
+        (tmp_path / f"rows.{number:08d}.arrows").write_bytes(bytes(100))
+    compact(tmp_path, 401)
+    reports = capsys.readouterr().err
+    assert len(reports) < 60_000
+    assert reports.splitlines()[-1] == "300 more damaged segments are not listed"
+    assert len([*(tmp_path / "damaged").iterdir()]) == 400
+
+
 def _readable(path: Path) -> list[Row]:
     found: list[Row] = []
     try:

@@ -25,7 +25,7 @@ from bench.support import tables
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 ALL = [(kind, address) for address, kind in enumerate((*KINDS, "yd1000"), 1)]
-LOOKS: dict[str, tuple[int, ...]] = {  # exception codes that answer a stop's first reads, by family
+REFUSALS: dict[str, tuple[int, ...]] = {  # exception codes that answer a stop's first reads, by family
     "erman-er-g-220": (2,),
     "invt-che": (0x11, 0x06),
     "innovert-ibd": (6,),
@@ -34,7 +34,7 @@ LOOKS: dict[str, tuple[int, ...]] = {  # exception codes that answer a stop's fi
     "yd1000": (4,),
     "fan": (1,),
 }
-MOST_LOOKS = 8  # limit of the reads that a start makes before its write
+MOST_READS = 8  # limit of the reads that a start makes before its write
 LATE, PATIENCE = 0.6, 3.0  # s: delay that makes replies too late to confirm a stop; limit for a stop
 CUT_SHORT = "cut short"  # words in the output of a client whose stops were aborted
 PAUSE = 2.5  # s; longer than the expiry of a start, and than each of its reads
@@ -79,7 +79,7 @@ def signal_during_start(chance: random.Random, rounds: int, is_long: bool) -> Co
     for _, kind in zip(range(rounds), kinds, strict=False):
         with victim([[(kind, 1)]], on_exit=True, sets=True) as client:
             client.begin(turning=False)
-            client.hold(chance.randint(0, MOST_LOOKS))
+            client.hold(chance.randint(0, MOST_READS))
             client.ask(do="start_aside", drive=0, verb="start")
             client.hear("asked")
             client.lines[0].held.wait(chance.uniform(0, 0.2))
@@ -97,7 +97,7 @@ def race(chance: random.Random, rounds: int, is_long: bool) -> Counters:
         with victim([[(kind, 1)]], sets=True) as client:
             for _ in range(rounds):
                 client.begin(turning=False)
-                client.hold(chance.randint(0, MOST_LOOKS))
+                client.hold(chance.randint(0, MOST_READS))
                 stop = chance.choice((*known.halts, "stop_all"))
                 client.ask(do="race", drive=0, verb="start", after=chance.uniform(0, 0.1), stop=stop)
                 client.asked_ns = client.hear("asked")["at"]
@@ -143,11 +143,11 @@ def two_lines(*, polls: bool) -> Attack:
     return attack
 
 
-def failing_looks(chance: random.Random, rounds: int, is_long: bool) -> Counters:
+def failing_reads(chance: random.Random, rounds: int, is_long: bool) -> Counters:
     """Stop a drive that replies to the first reads with an exception, or 0.6 s late to every request."""
     counters = Counters()
     for _ in range(rounds):
-        for kind, codes in LOOKS.items():
+        for kind, codes in REFUSALS.items():
             with victim([[(kind, 1)]]) as client:
                 client.lines[0].troubles = [chance.choice(codes)] * chance.randint(1, 2)
                 _stop(client, counters, f"{len(client.lines[0].troubles)} exceptions")
@@ -199,7 +199,7 @@ ATTACKS: dict[str, tuple[Attack, float]] = {  # attack's name: its function, and
     "a deaf line": (deaf, 0.5),
     "two buses": (two_lines(polls=False), 0.5),
     "two lines of a poller": (two_lines(polls=True), 0.5),
-    "looks that fail": (failing_looks, 0.5),
+    "reads that fail": (failing_reads, 0.5),
     "a pause while it starts": (paused, 1),
     "a cut network": (cut_networks, 0.5),
 }

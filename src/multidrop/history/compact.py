@@ -38,6 +38,8 @@ from {} group by all order by drive, register, time
 MERGED = "select * exclude filename from {} order by drive, register, time"
 MERGED_ROWS = "select * exclude filename from {} order by drive, time"
 MOST_MERGED = 200_000_000  # limit in bytes for the files of `rows/` that are merged into one
+# limits of reported sentences and of their length, because a full pipe would block the process for ever
+MOST_REPORTED, LONGEST_REPORTED = 100, 500
 
 
 def main(words: list[str] | None = None) -> int:
@@ -69,9 +71,16 @@ def compact(folder: Path, below: int, *, merge_rows: bool = False) -> None:
         (folder / name).mkdir(exist_ok=True)
     clean(folder)
     with closing(Database(MEMORY, folder / ".spill")) as database:
+        damage: list[str] = []
         for number, path in segments_of(folder / STEM):
             if number < below:
-                _compact_segment(database, folder, number, path)
+                found = _compact_segment(database, folder, number, path)
+                for sentence in found[: max(0, MOST_REPORTED - len(damage))]:
+                    print(sentence[:LONGEST_REPORTED], file=sys.stderr)
+                damage += found
+                _put_away(folder, path, bool(found))
+        if len(damage) > MOST_REPORTED:
+            print(f"{len(damage) - MOST_REPORTED} more damaged segments are not listed", file=sys.stderr)
         if merge_rows:
             rows = widest(parquet_files(folder / "rows"))
             # before the merge, because a merged file does not show which of its parts lack summaries
@@ -116,7 +125,8 @@ def _put_away(folder: Path, path: Path, is_damaged: bool) -> None:
             path.unlink()
 
 
-def _compact_segment(database: Database, folder: Path, number: int, path: Path) -> None:
+def _compact_segment(database: Database, folder: Path, number: int, path: Path) -> list[str]:
+    """Convert a segment to Parquet, and return a sentence for each damage in it."""
     damage: list[str] = []
     with database.cursor() as cursor:
         metadata = {}
@@ -126,7 +136,7 @@ def _compact_segment(database: Database, folder: Path, number: int, path: Path) 
             if reader.truncated:
                 damage.append(f"{path} ends within a batch: its last {reader.truncated} bytes were skipped")
         except FileNotFoundError:  # the recorder has removed the old segment
-            return
+            return []
         except ValueError as error:
             damage.append(str(error))
         else:
@@ -139,9 +149,7 @@ def _compact_segment(database: Database, folder: Path, number: int, path: Path) 
                 name = file_name(number, number, least, most)
                 _write(cursor, TENS.format("with_units"), folder / "tens" / name)
                 _write(cursor, ROWS, folder / "rows" / name, metadata)
-    for sentence in damage:
-        print(sentence, file=sys.stderr)
-    _put_away(folder, path, bool(damage))
+    return damage
 
 
 def _readable(reader: ArrowsReader, damage: list[str]) -> Iterator[Rows]:
