@@ -466,3 +466,13 @@ def test_an_invalid_alarm_limit_is_refused(tmp_path: Path, limit: str, sentence:
     path.write_text(plant_text("/dev/ttyUSB0", ["pump-1"]) + f"\n[[serve.limit]]\n{limit}\n")
     with pytest.raises(PlantError, match=f"limit number 1: .*{sentence}"):
         read_settings(Plant.load(path), {})
+
+
+def test_alarms_are_raised_and_found_although_the_clock_is_set_back() -> None:
+    """The clock is set back by 1000 s while a motor stands, and again while the alarm is active."""
+    events = Alarms()
+    for time, shown in ((2_000_000, RUNS), (2_001_000, STANDS), (1_002_000, STANDS), (1_004_000, STANDS)):
+        events.look(time, "pump-1", shown, 0)
+    events.look(5_000, "pump-1", RUNS, 0)
+    [alarm] = events.between(1_000_000, 1_100_000)
+    assert (alarm.kind, alarm.time, alarm.ended) == ("stopped", 1_002_000, 5_000)

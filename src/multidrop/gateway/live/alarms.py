@@ -140,7 +140,8 @@ class Alarms:
             self._stands.pop(drive, None)
             self._end(time, "", drive, STOPPED)
         elif state in (STANDS, UNKNOWN) and drive in self._runs:
-            since = self._stands.setdefault(drive, time)
+            # the lesser time, in case the clock was set back meanwhile
+            since = self._stands[drive] = min(time, self._stands.get(drive, time))
             is_called = stops != self._runs[drive]
             if is_called or time - since >= STANDS_MS:
                 self._forget_run(drive)
@@ -246,9 +247,9 @@ class Alarms:
     def between(self, begin: int, end: int) -> list[Alarm]:
         """Return the alarms that were active between two times (UTC, ms), newest first."""
         found = [one for one in (*self._lasting.values(), *self._ended) if one.time <= end]
-        return sorted(
-            (one for one in found if one.ended is None or one.ended >= begin), key=lambda alarm: -alarm.time
-        )
+        # an alarm ends before it starts if the clock was set back meanwhile
+        lasting = (one for one in found if one.ended is None or max(one.time, one.ended) >= begin)
+        return sorted(lasting, key=lambda alarm: -alarm.time)
 
     @property
     def lasting(self) -> list[Alarm]:
