@@ -334,17 +334,13 @@ async def test_a_line_can_be_closed_after_polling_has_failed(taken: Taken) -> No
 
 
 @pytest.mark.long
-def test_fleet_status_counts_lines_without_polling(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_fleet_status_counts_unpolled_lines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     failures = {"hall": "Ill: of its class"}
     monkeypatch.setattr(Poller, "line_failures", property(lambda poller: failures))
-
-    async def main() -> dict[str, Any]:
-        made = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
-        state = made.state()
-        await made._close()
-        return json.loads(json.dumps(state))
-
-    state = asyncio.run(main())
+    made = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
+    state = made.state()
+    await made._close()
+    state = json.loads(json.dumps(state))
     assert (state["failing"], state["troubles"]) == (["hall"], {"hall": "polling fails: Ill: of its class"})
     fleet = {"gateways": {"gw-1": {"says": state}}, "lines": {}}
     assert failing_lines(fleet) == ["hall"]

@@ -162,18 +162,13 @@ def test_the_server_refuses_each_request_that_a_user_has_no_right_to_send(
     assert refusals_where_all_is_allowed == set()
 
 
-def test_missing_credentials_are_refused(as_written: SecuredCluster) -> None:
-    async def main() -> None:
-        options = as_written.options("hub")
-        everybody: list[dict[str, Any]] = [{}, {"user": "operator", "password": ""}, {"token": "x"}]
-        tls = {"tls": options["tls"], "tls_handshake_first": True}
-        for user in everybody:
-            with pytest.raises(Exception, match="Authorization Violation"):
-                await Client().connect(
-                    as_written.urls[0], allow_reconnect=False, error_cb=_ignore, **tls, **user
-                )
-
-    asyncio.run(asyncio.wait_for(main(), PATIENCE_S))
+async def test_missing_credentials_are_refused(as_written: SecuredCluster) -> None:
+    options = as_written.options("hub")
+    everybody: list[dict[str, Any]] = [{}, {"user": "operator", "password": ""}, {"token": "x"}]
+    tls = {"tls": options["tls"], "tls_handshake_first": True}
+    for user in everybody:
+        with pytest.raises(Exception, match="Authorization Violation"):
+            await Client().connect(as_written.urls[0], allow_reconnect=False, error_cb=_ignore, **tls, **user)
 
 
 async def _ignore(_: Exception) -> None:

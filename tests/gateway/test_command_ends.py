@@ -60,15 +60,11 @@ class UnopenedLines:
     ],
     ids=["a write", "a verb", "a stop", "a stop of all"],
 )
-def test_the_end_time_of_the_last_command_is_known(command: Callable[[Commands], Awaitable[Any]]) -> None:
+def test_the_end_time_of_the_last_command_is_known(command: Callable[[Commands], Any]) -> None:
     commands = Commands(UnopenedLines(), MAY)
     assert commands.ended_ns("mill") == 0
     begun_ns = time.monotonic_ns()
-
-    async def carry_out() -> None:
-        await command(commands)
-
-    asyncio.run(carry_out())
+    asyncio.run(command(commands))
     assert begun_ns <= commands.ended_ns("mill") <= time.monotonic_ns()
 
 
@@ -100,11 +96,7 @@ def test_an_invalid_number_in_a_write_is_reported(register: str, value: float) -
     lines = UnopenedLines()
     lines.plant = plant_of(("hall", mill))
     may = May(write=frozenset({"mill.control", "mill.setpoint"}))
-
-    async def carry_out() -> CommandResult:
-        return await Commands(lines, may).write("mill", register, value, CALLER)
-
-    told = asyncio.run(carry_out())
+    told = asyncio.run(Commands(lines, may).write("mill", register, value, CALLER))
     assert told.ok == (register == "setpoint" and value == 1.5)
     assert told.text.startswith(("mill: setpoint", "setpoint ", "control takes"))
     assert len(line.written) == told.ok

@@ -345,8 +345,8 @@ async def commanded(servers: SecuredCluster, made: Desks) -> AsyncIterator[Comma
         yield subjects
 
 
-def test_a_commander_may_command_and_a_viewer_may_not(servers: SecuredCluster, tmp_path: Path) -> None:
-    async def main(made: Desks) -> None:
+async def test_a_commander_may_command_and_a_viewer_may_not(servers: SecuredCluster, tmp_path: Path) -> None:
+    with desks(tmp_path) as made:
         async with commanded(servers, made):
             for user, outcome in (("viewer", CommandOutcome.NOT_SENT), ("commander", CommandOutcome.DONE)):
                 log = tmp_path / f"{user}.jsonl"
@@ -362,9 +362,6 @@ def test_a_commander_may_command_and_a_viewer_may_not(servers: SecuredCluster, t
                     assert stopped.ok == told.ok, stopped.text
             assert [name for name, _ in made.writes] == ["frequency", "control"]
 
-    with desks(tmp_path) as made:
-        asyncio.run(main(made))
-
 
 async def nobody_is_asked(asker: Client) -> bool:
     """Return True if the server reports that no gateway subscribes to the line's commands."""
@@ -378,11 +375,10 @@ async def nobody_is_asked(asker: Client) -> bool:
         return False
 
 
-def test_servers_report_that_no_gateway_polls_a_line(servers: SecuredCluster, tmp_path: Path) -> None:
+async def test_servers_report_that_no_gateway_polls_a_line(servers: SecuredCluster, tmp_path: Path) -> None:
     """Servers report a missing gateway although the commander and gateways are in different NATS accounts."""
-
-    async def main(made: Desks) -> None:
-        async with commanded(servers, made) as subjects:
+    with desks(tmp_path) as made:
+        async with asyncio.timeout(PATIENCE_S), commanded(servers, made) as subjects:
             askers = [await connect(url, servers.options("commander")) for url in servers.urls]
             assert not any([await nobody_is_asked(asker) for asker in askers])
             subjects.shut(LINE)
@@ -391,6 +387,3 @@ def test_servers_report_that_no_gateway_polls_a_line(servers: SecuredCluster, tm
             for asker in askers:
                 await asker.close()
         assert made.writes == []
-
-    with desks(tmp_path) as made:
-        asyncio.run(asyncio.wait_for(main(made), PATIENCE_S))

@@ -46,10 +46,10 @@ def setpoints(desk: Desks) -> list[int]:
     return [raw for name, raw in desk.writes if name == SETPOINT]
 
 
-def test_a_command_is_logged_before_and_after_it_is_carried_out(desk: Desks, tmp_path: Path) -> None:
+async def test_a_command_is_logged_before_and_after_it_is_carried_out(desk: Desks, tmp_path: Path) -> None:
     token = desk.offered(20.0)
     assert desk.writes == []
-    answer = asyncio.run(desk.do(token))
+    answer = await desk.do(token)
     assert answer.outcome is DONE
     assert answer.held == "20.00 Hz"
     assert setpoints(desk) == [2000]
@@ -60,15 +60,11 @@ def test_a_command_is_logged_before_and_after_it_is_carried_out(desk: Desks, tmp
     assert (frame["by"], frame["way"]) == ("anna", "fleet")
 
 
-def test_a_duplicated_confirmation_is_carried_out_once_with_one_answer(desk: Desks) -> None:
+async def test_a_duplicated_confirmation_is_carried_out_once_with_one_answer(desk: Desks) -> None:
     token = desk.offered()
-
-    async def twice() -> list[CommandAnswer]:
-        together = await asyncio.gather(*(desk.do(token) for _ in range(5)))
-        desk.clock.pass_s(100)
-        return [*together, await desk.do(token)]
-
-    answers = asyncio.run(twice())
+    answers = await asyncio.gather(*(desk.do(token) for _ in range(5)))
+    desk.clock.pass_s(100)
+    answers.append(await desk.do(token))
     assert {(answer.outcome, answer.text) for answer in answers} == {(DONE, answers[0].text)}
     assert setpoints(desk) == [2000]
 
@@ -79,17 +75,17 @@ def test_copies_of_a_command_request_get_the_same_offer(desk: Desks) -> None:
     assert desk.offered(**same) != desk.offered(**(same | {"id": "two"}))
 
 
-@pytest.mark.parametrize(("seconds", "outcome"), [(0.5, DONE), (1.0, NOT_SENT), (60.0, NOT_SENT)])
-def test_a_late_confirmation_sends_nothing(desk: Desks, seconds: float, outcome: CommandOutcome) -> None:
+@pytest.mark.parametrize(("late_s", "outcome"), [(0.5, DONE), (1.0, NOT_SENT), (60.0, NOT_SENT)])
+async def test_a_late_confirmation_sends_nothing(desk: Desks, late_s: float, outcome: CommandOutcome) -> None:
     token = desk.offered()
-    desk.clock.pass_s(seconds)
-    answer = asyncio.run(desk.do(token))
+    desk.clock.pass_s(late_s)
+    answer = await desk.do(token)
     assert answer.outcome is outcome
     assert len(setpoints(desk)) == (outcome is DONE)
     assert ("s have passed since the offer" in answer.text) == (outcome is NOT_SENT)
 
 
-def do_after(desk: Desks, deed: Callable[[], object], waited_s: float = 0.0) -> CommandAnswer:
+async def do_after(desk: Desks, deed: Callable[[], object], waited_s: float = 0.0) -> CommandAnswer:
     """Confirm an offer after `waited_s`. The command's thread calls `deed` before it sends the command."""
     token = desk.offered()
     offer = desk.desk.offers.find(token)
@@ -101,22 +97,22 @@ def do_after(desk: Desks, deed: Callable[[], object], waited_s: float = 0.0) -> 
 
     offer.prepared = offer.prepared._replace(work=late)
     desk.clock.pass_s(waited_s)
-    return asyncio.run(desk.do(token))
+    return await desk.do(token)
 
 
 @patient
-def test_a_command_whose_thread_is_slow_is_not_sent_after_a_second(tmp_path: Path) -> None:
+async def test_a_command_whose_thread_is_slow_is_not_sent_after_a_second(tmp_path: Path) -> None:
     """A command must be sent within a second of its offer. The bus waits only for the rest of this second."""
     with desks(tmp_path, patience_s=0) as desk:
-        answer = do_after(desk, lambda: time.sleep(0.2), waited_s=0.95)
+        answer = await do_after(desk, lambda: time.sleep(0.2), waited_s=0.95)
         assert answer.outcome is NOT_SENT
         assert "did not come within" in answer.text
         assert desk.writes == []
 
 
-def test_a_stop_cancels_a_command_until_it_is_sent(desk: Desks) -> None:
+async def test_a_stop_cancels_a_command_until_it_is_sent(desk: Desks) -> None:
     """Right before it sends a command, the bus checks again whether a stop has cancelled the offer."""
-    answer = do_after(desk, lambda: desk.desk.offers.void(LINE, ["pump"], "a stop was called"))
+    answer = await do_after(desk, lambda: desk.desk.offers.void(LINE, ["pump"], "a stop was called"))
     assert answer.outcome is NOT_SENT
     assert desk.writes == []
 
@@ -136,7 +132,7 @@ def test_a_command_is_on_the_disk_before_it_is_sent(tmp_path: Path, monkeypatch:
         assert synced == [(1, 0), (2, 1)]
 
 
-def while_noted(desk: Desks, deed: Callable[[], object]) -> CommandAnswer:
+async def while_noted(desk: Desks, deed: Callable[[], object]) -> CommandAnswer:
     """Call `deed` while the first record of a command is logged, right before the command is sent."""
 
     def before(record: dict[str, Any]) -> None:
@@ -145,7 +141,7 @@ def while_noted(desk: Desks, deed: Callable[[], object]) -> CommandAnswer:
 
     token = desk.offered()
     desk.log.before = before
-    return asyncio.run(desk.do(token))
+    return await desk.do(token)
 
 
 def let_go_and_take(desk: Desks) -> None:
@@ -164,64 +160,60 @@ MEANWHILE: dict[str, Callable[[Desks], object]] = {
 
 @pytest.mark.parametrize("deed", MEANWHILE)
 @pytest.mark.parametrize("is_late", [False, True])
-def test_a_command_with_an_invalid_offer_is_not_sent(desk: Desks, deed: str, is_late: bool) -> None:
+async def test_a_command_with_an_invalid_offer_is_not_sent(desk: Desks, deed: str, is_late: bool) -> None:
     """The offer becomes invalid before it is confirmed, or between its confirmation and the write."""
     if is_late:
-        answer = while_noted(desk, lambda: MEANWHILE[deed](desk))
+        answer = await while_noted(desk, lambda: MEANWHILE[deed](desk))
     else:
         token = desk.offered()
         MEANWHILE[deed](desk)
-        answer = asyncio.run(desk.do(token))
+        answer = await desk.do(token)
     assert answer.outcome is NOT_SENT
     assert desk.writes == []
 
 
-def test_a_stop_of_another_drive_does_not_cancel_a_command(desk: Desks) -> None:
+async def test_a_stop_of_another_drive_does_not_cancel_a_command(desk: Desks) -> None:
     token = desk.offered()
     desk.desk.offers.void(LINE, ["fan"], "a stop was called")
     desk.desk.offers.void("hall-2", None, "a stop was called")
-    assert asyncio.run(desk.do(token)).outcome is DONE
+    assert (await desk.do(token)).outcome is DONE
 
 
-def test_a_restarted_gateway_rejects_confirmations_of_earlier_offers(desk: Desks, tmp_path: Path) -> None:
+async def test_a_restarted_gateway_rejects_confirmations_of_old_offers(desk: Desks, tmp_path: Path) -> None:
     token = desk.offered()
     with desks(tmp_path) as after:
-        assert asyncio.run(after.do(token)).outcome is UNKNOWN
+        assert (await after.do(token)).outcome is UNKNOWN
         assert after.writes == []
-    assert asyncio.run(desk.do(f"{token}x")).outcome is UNKNOWN
+    assert (await desk.do(f"{token}x")).outcome is UNKNOWN
     assert desk.writes == []
 
 
-def test_only_the_master_answers_a_command_or_a_stop(desk: Desks) -> None:
+async def test_only_the_master_answers_a_command_or_a_stop(desk: Desks) -> None:
     """A gateway that does not poll the line must stay silent, because the sender uses the first answer."""
     desk.is_master = False
     assert desk.ask(register=SETPOINT, value=20.0) is None
-    assert asyncio.run(desk.stop()) is None
+    assert await desk.stop() is None
     desk.is_master = True
     assert isinstance(desk.ask(register=SETPOINT, value=20.0), Offered)
 
 
-def test_a_new_master_accepts_stops_but_no_commands_during_the_guard_time(desk: Desks) -> None:
+async def test_a_new_master_accepts_stops_but_no_commands_during_the_guard_time(desk: Desks) -> None:
     """During the guard time, frames of the line's previous master may still be on the line."""
     desk.is_guarded = True
     assert desk.ask(register=SETPOINT, value=20.0) is None
-    assert asyncio.run(desk.stop()).outcome is DONE
+    assert (await desk.stop()).outcome is DONE
     assert desk.written == {"control"}
 
 
-def test_a_request_for_the_result_withdraws_an_unconfirmed_offer(desk: Desks) -> None:
+async def test_a_request_for_the_result_withdraws_an_unconfirmed_offer(desk: Desks) -> None:
     token = desk.offered()
-
-    async def main() -> list[CommandAnswer]:
-        asked = await desk.desk.do(json.dumps({"ask": token}).encode())
-        return [asked, await desk.do(token)]
-
-    assert [answer.outcome for answer in asyncio.run(main())] == [NOT_SENT, NOT_SENT]
+    assert (await desk.desk.do(json.dumps({"ask": token}).encode())).outcome is NOT_SENT
+    assert (await desk.do(token)).outcome is NOT_SENT
     assert desk.writes == []
 
 
 @patient
-def test_without_a_permission_list_only_stops_are_carried_out(tmp_path: Path) -> None:
+async def test_without_a_permission_list_only_stops_are_carried_out(tmp_path: Path) -> None:
     with desks(tmp_path, {}) as desk:
         for what in ({"register": SETPOINT, "value": 20.0}, {"verb": "start"}, {"verb": "emergency_stop"}):
             answer = desk.ask(**what)
@@ -229,7 +221,7 @@ def test_without_a_permission_list_only_stops_are_carried_out(tmp_path: Path) ->
             assert answer.outcome is REFUSED
             assert "is not in the plant's list" in answer.text
         assert desk.writes == []
-        assert asyncio.run(desk.stop()).outcome is DONE
+        assert (await desk.stop()).outcome is DONE
         assert desk.written == {"control"}
 
 
@@ -243,35 +235,26 @@ def test_a_damaged_permission_list_allows_nothing(tmp_path: Path, may: Any) -> N
 
 
 @pytest.mark.slow
-def test_a_start_command_runs_the_motor_and_a_stop_stops_it(desk: Desks) -> None:
-    async def main() -> list[CommandOutcome]:
-        found = [(await desk.do(desk.offered(20.0))).outcome]
-        found.append((await desk.do(desk.offered(verb="start", options={"direction": "forward"}))).outcome)
-        stopped = await desk.stop(drives=None)
-        return [*found, stopped.outcome]
-
-    assert asyncio.run(main()) == [DONE, DONE, DONE]
+async def test_a_start_command_runs_the_motor_and_a_stop_stops_it(desk: Desks) -> None:
+    assert (await desk.do(desk.offered(20.0))).outcome is DONE
+    assert (await desk.do(desk.offered(verb="start", options={"direction": "forward"}))).outcome is DONE
+    assert (await desk.stop(drives=None)).outcome is DONE
     assert {"begun", "over"} == {note["step"] for note in desk.notes if note["what"] == "stop"}
 
 
 @pytest.mark.slow
-def test_a_long_stop_reports_its_progress(desk: Desks) -> None:
+async def test_a_long_stop_reports_its_progress(desk: Desks) -> None:
     """The sender must know early that the stop was sent: a motor may take long to stop."""
     desk.sim["output_frequency"] = 10.0
     data = json.dumps({"id": "one", "by": "anna", "drives": None}).encode()
     sentence = "pump: the stop was confirmed, but the motor is not yet seen to stand"
-
-    async def main() -> CommandAnswer:
-        while True:
-            answer = await desk.stops.stop(LINE, data)
-            if answer.outcome is not CommandOutcome.UNDER_WAY:
-                return answer
+    async with asyncio.timeout(PATIENCE_S):
+        while (answer := await desk.stops.stop(LINE, data)).outcome is CommandOutcome.UNDER_WAY:
             if answer.text.startswith(sentence):
                 assert answer.drives["pump"].outcome is CommandOutcome.UNDER_WAY
                 assert desk.written == {"control"}
                 desk.sim["output_frequency"] = 0.0
-
-    assert asyncio.run(asyncio.wait_for(main(), PATIENCE_S)).outcome is DONE
+    assert answer.outcome is DONE
 
 
 LOSSES: dict[str, Callable[[Desks], object]] = {
@@ -298,15 +281,11 @@ def test_a_stop_of_a_lost_line_has_no_answer(desk: Desks, monkeypatch: pytest.Mo
     assert desk.written == {"control"}
 
 
-def test_a_stop_is_sent_once_despite_copies_and_cancels_offered_commands(desk: Desks) -> None:
+async def test_a_stop_is_sent_once_despite_copies_and_cancels_offered_commands(desk: Desks) -> None:
     token = desk.offered()
-
-    async def main() -> CommandAnswer:
-        copies = await asyncio.gather(*(desk.stop(id="one") for _ in range(3)))
-        assert len({copy.text for copy in copies if copy}) == 1
-        return await desk.do(token)
-
-    answer = asyncio.run(main())
+    copies = await asyncio.gather(*(desk.stop(id="one") for _ in range(3)))
+    assert len({copy.text for copy in copies if copy}) == 1
+    answer = await desk.do(token)
     assert answer.outcome is NOT_SENT
     assert "a stop was called" in answer.text
     assert len([name for name, _ in desk.writes if name == "control"]) == 1
@@ -317,23 +296,20 @@ def full_disk(record: Any) -> None:
     raise OSError(28, "No space left on device")
 
 
-def test_a_full_disk_blocks_commands_but_not_stops(desk: Desks) -> None:
+async def test_a_full_disk_blocks_commands_but_not_stops(desk: Desks) -> None:
     token = desk.offered()
     desk.log.before = full_disk
-    answer = asyncio.run(desk.do(token))
+    answer = await desk.do(token)
     assert answer.outcome is NOT_SENT
     assert "the log of commands cannot be written" in answer.text
     assert desk.writes == []
-    assert asyncio.run(desk.stop()).outcome is DONE
+    assert (await desk.stop()).outcome is DONE
 
 
 @pytest.mark.slow
-def test_concurrent_writes_on_a_line_are_limited(desk: Desks) -> None:
-    async def main() -> list[CommandAnswer]:
-        tokens = [desk.offered(20.0 + number) for number in range(MOST_WRITES + 3)]
-        return await asyncio.gather(*(desk.do(token) for token in tokens))
-
-    answers = asyncio.run(main())
+async def test_concurrent_writes_on_a_line_are_limited(desk: Desks) -> None:
+    tokens = [desk.offered(20.0 + number) for number in range(MOST_WRITES + 3)]
+    answers = await asyncio.gather(*(desk.do(token) for token in tokens))
     unsent = [answer.text for answer in answers if answer.outcome is NOT_SENT]
     assert sum(f"{MOST_WRITES} other commands are under way" in text for text in unsent) == 3
     assert len(setpoints(desk)) == len(answers) - len(unsent)
@@ -434,7 +410,7 @@ ODD_STOPS = [  # stop messages that any client may send, or that a network may d
 
 
 @pytest.mark.parametrize("data", every_third(ODD_STOPS))
-def test_a_malformed_stop_is_carried_out(
+async def test_a_malformed_stop_is_carried_out(
     desk: Desks,
     data: bytes,
     caplog: pytest.LogCaptureFixture,
@@ -444,7 +420,7 @@ def test_a_malformed_stop_is_carried_out(
     """The name of its sender is logged as printable text. Without drives, it stops all drives of the line."""
     # the test must not repeat a stop that has no id, because each repetition would be a new stop
     monkeypatch.setattr(desk_module, "HOLD_S", PATIENCE_S)
-    answer = asyncio.run(desk.stop_by(data))
+    answer = await desk.stop_by(data)
     assert answer.drives["pump"].outcome is DONE
     assert desk.written == {"control"}
     assert all(record.getMessage().isprintable() for record in caplog.records)
@@ -472,21 +448,21 @@ def test_a_stop_with_a_new_id_is_a_new_stop(desk: Desks, first: dict[str, Any], 
     assert len(desk.writes) == before + 1
 
 
-def test_a_stop_that_names_an_unknown_drive_still_stops_the_known_drives(desk: Desks) -> None:
-    answer = asyncio.run(desk.stop(drives=["pump", "fan"]))
+async def test_a_stop_that_names_an_unknown_drive_still_stops_the_known_drives(desk: Desks) -> None:
+    answer = await desk.stop(drives=["pump", "fan"])
     assert answer.outcome is REFUSED
     assert {name: one.outcome for name, one in answer.drives.items()} == {"pump": DONE, "fan": REFUSED}
 
 
 @patient
-def test_only_stops_accept_another_unicode_form_of_a_drives_name(tmp_path: Path) -> None:
+async def test_only_stops_accept_another_unicode_form_of_a_drives_name(tmp_path: Path) -> None:
     """Keyboards differ: a u with two dots is one character (U+00FC) or two (U+0075 U+0308)."""
     fan, spelt = "L\u00fcfter", "Lu\u0308fter"
     with desks(tmp_path, {"write": [f"{spelt}.frequency"]}, name=fan) as desk:
         told = desk.ask(drive=spelt, register="frequency", value=20.0)
         assert isinstance(told, CommandAnswer)
         assert told.outcome is REFUSED
-        answer = asyncio.run(desk.stop(drives=[spelt, fan]))
+        answer = await desk.stop(drives=[spelt, fan])
         assert {name: one.outcome for name, one in answer.drives.items()} == {fan: DONE}
         assert desk.writes == [("control", 0xC000)]
 

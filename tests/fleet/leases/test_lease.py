@@ -558,7 +558,7 @@ async def test_a_session_that_is_over_stays_over_after_an_outage() -> None:
 
 
 async def test_a_sessions_end_written_during_an_outage_counts_after_a_lease() -> None:
-    """The session's own gateway may have renewed it, unseen, right before another gateway wrote its end."""
+    """The gateway may have renewed its session, unseen, right before another gateway wrote the end."""
     trial, _lease, observer = await watched()
     await observer.end_the_dead()
     trial.clock.pass_s(60)

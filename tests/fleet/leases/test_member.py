@@ -1,4 +1,4 @@
-"""Members, the state machines of gateways, on real NATS servers, with fake lines."""
+"""The state machines of gateways on real NATS servers, with fake lines."""
 
 from __future__ import annotations
 
@@ -193,7 +193,7 @@ class Ports:
 
 @pytest.mark.slow
 @pytest.mark.long
-async def test_lines_that_cannot_be_opened_move(fleet: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_lines_move_if_they_cannot_be_opened(fleet: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
     """A gateway is cut off from its lines but not from the servers, so its lease stays valid."""
     monkeypatch.setattr(shares, "LOST_NS", SECOND // 2)
     # longer than a failed attempt to open a line again, which takes up to 2 s
@@ -233,25 +233,24 @@ async def test_a_drained_gateway_releases_all_lines_and_claims_none(fleet: Clust
 
 @pytest.mark.slow
 @pytest.mark.long
-def test_with_a_silent_server_only_a_drain_releases(fleet: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_with_a_silent_server_only_a_drain_releases(
+    fleet: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
     silent = Replica("n3", is_current=False, is_offline=True, active_ns=0)
 
     async def maimed(*_: object) -> Servers:
         return Servers("n1", (silent,))
 
-    async def main() -> None:
-        async with gateways(fleet, "a", "b", terms=LONG) as running:
-            await until(running.are_shared, "start")
-            monkeypatch.setattr(releases, "known_cluster", maimed)
-            joined, drained = await running.join("c"), running.members["b"]
-            await until(lambda: "c" in drained.wanted.values(), "its share")
-            await asyncio.sleep(1.0)
-            assert not joined.polled
-            drained.drain()
-            await until(lambda: not drained.polled and running.all_are_polled(), "drain")
-
     monkeypatch.setattr(member_module, "SILENT_SERVER_S", math.inf)
-    asyncio.run(main())
+    async with gateways(fleet, "a", "b", terms=LONG) as running:
+        await until(running.are_shared, "start")
+        monkeypatch.setattr(releases, "known_cluster", maimed)
+        joined, drained = await running.join("c"), running.members["b"]
+        await until(lambda: "c" in drained.wanted.values(), "its share")
+        await asyncio.sleep(1.0)
+        assert not joined.polled
+        drained.drain()
+        await until(lambda: not drained.polled and running.all_are_polled(), "drain")
 
 
 @pytest.mark.slow
@@ -522,24 +521,20 @@ def test_there_is_a_pause_of_10_ms_between_steps_however_often_records_change() 
 
 
 @pytest.mark.parametrize(("left_s", "ends"), [(2.0, True), (0.9, False), (-1.0, False)])
-def test_a_gateway_whose_own_lease_expires_soon_ends_no_other_session(left_s: float, ends: bool) -> None:
+async def test_a_gateway_whose_lease_expires_soon_ends_no_other_session(left_s: float, ends: bool) -> None:
     """If its own lease expires, all servers may be failing. A session that it ended could not continue."""
+    member = a_member()
+    clock = HandClock()
+    member.lease.clock = clock
+    member.lease.until = clock.now + 2 * SECOND
+    await member.step()  # the first step restarts the waiting times for all sessions
+    asked: list[object] = []
 
-    async def main() -> bool:
-        member = a_member()
-        clock = HandClock()
-        member.lease.clock = clock
-        member.lease.until = clock.now + 2 * SECOND
-        await member.step()  # the first step restarts the waiting times for all sessions
-        asked: list[object] = []
+    async def note(present: object) -> bool:
+        asked.append(present)
+        return False
 
-        async def note(present: object) -> bool:
-            asked.append(present)
-            return False
-
-        member.records.observer.end_the_dead = note
-        member.lease.until = clock.now + round(left_s * SECOND)
-        await member.step()
-        return bool(asked)
-
-    assert asyncio.run(main()) is ends
+    member.records.observer.end_the_dead = note
+    member.lease.until = clock.now + round(left_s * SECOND)
+    await member.step()
+    assert bool(asked) is ends

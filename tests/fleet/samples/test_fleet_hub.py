@@ -188,24 +188,20 @@ async def test_the_hub_limits_the_memory_of_a_commit(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("fates", ["", "bab"], ids=["at once", "after failures"])
-def test_the_hub_counts_lost_and_doubled_messages_once(
+async def test_the_hub_counts_lost_and_doubled_messages_once(
     running: Cluster, caplog: pytest.LogCaptureFixture, fates: str
 ) -> None:
-    async def live() -> HubState:
-        async with empty_stream(running) as path:
-            for sequence, source in ((1, "a.x"), (3, "b.x"), (2, "a.x"), (5, "a.x"), (5, "a.x"), (4, "a.x")):
-                await say(path, sequence, message(sequence * 5), source)
-            await say(path, 6, b"no message", "a.x")
-            await say(path, 7, message(0), "a.x", lost=70)
-            await say(path, 8, message(5), "a.x", lost=70)
-            assert await publish(path, "samples.c.x", message(0), {})
-            sink = Memory(fates)
-            state = await read_all(path, sink, 10)
-            assert sum(commit.rows for commit in sink.commits) == 6 * 50
-            assert sink.commits[-1].sources == {"a.x": 8, "b.x": 3}
-            return state
-
-    state = asyncio.run(live())
+    async with empty_stream(running) as path:
+        for sequence, source in ((1, "a.x"), (3, "b.x"), (2, "a.x"), (5, "a.x"), (5, "a.x"), (4, "a.x")):
+            await say(path, sequence, message(sequence * 5), source)
+        await say(path, 6, b"no message", "a.x")
+        await say(path, 7, message(0), "a.x", lost=70)
+        await say(path, 8, message(5), "a.x", lost=70)
+        assert await publish(path, "samples.c.x", message(0), {})
+        sink = Memory(fates)
+        state = await read_all(path, sink, 10)
+        assert sum(commit.rows for commit in sink.commits) == 6 * 50
+        assert sink.commits[-1].sources == {"a.x": 8, "b.x": 3}
     assert (state.alarms, state.missing, state.doubled) == (7, 4, 2)
     errors = [record.getMessage() for record in caplog.records if record.levelno == logging.ERROR]
     told = [error for error in errors if "samples are not stored" not in error]

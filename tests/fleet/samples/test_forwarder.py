@@ -320,7 +320,7 @@ async def test_the_forwarder_waits_for_a_missing_stream(running: Cluster, tmp_pa
 
 
 @pytest.mark.long
-def test_insufficient_rights_are_reported_in_one_sentence(tmp_path: Path) -> None:
+async def test_insufficient_rights_are_reported_in_one_sentence(tmp_path: Path) -> None:
     with cluster(tmp_path, 1) as servers:
         path = tmp_path / "n1.conf"
         servers.nodes[0].kill()
@@ -330,19 +330,15 @@ def test_insufficient_rights_are_reported_in_one_sentence(tmp_path: Path) -> Non
         path.write_text(path.read_text() + f"authorization {{ users: [ {rights} ] }}\n")
         servers.nodes[0].start()
         servers.wait()
-
-        async def live() -> None:
-            wrong, right = ({"user": "gateway-2", "password": word} for word in ("wrong", "x"))
-            with pytest.raises(FleetError, match="refuses these credentials, or the lack of any"):
-                async with samples_path(servers.urls, wrong):
-                    pass
-            async with samples_path(servers.urls, right) as path:
-                await create_stream(path, replicas=1)
-                assert await publish(path, subject_of("gateway-2", "b"), b"", {}) == 1
-                with pytest.raises(NoRight, match=r"do not allow publishing to samples\.gateway-1"):
-                    await publish(path, subject_of("gateway-1", "b"), b"", {})
-
-        asyncio.run(live())
+        wrong, right = ({"user": "gateway-2", "password": word} for word in ("wrong", "x"))
+        with pytest.raises(FleetError, match="refuses these credentials, or the lack of any"):
+            async with samples_path(servers.urls, wrong):
+                pass
+        async with samples_path(servers.urls, right) as path:
+            await create_stream(path, replicas=1)
+            assert await publish(path, subject_of("gateway-2", "b"), b"", {}) == 1
+            with pytest.raises(NoRight, match=r"do not allow publishing to samples\.gateway-1"):
+                await publish(path, subject_of("gateway-1", "b"), b"", {})
 
 
 # ---- kills of every process between a poller and the sinks: no reported sample is lost or duplicated ----

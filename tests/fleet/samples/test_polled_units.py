@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import socket
 import time
 from email.parser import BytesParser
@@ -245,24 +244,19 @@ def say_with(url: str, subject: str, headers: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("parser", [None, _as_mail])
-def test_no_message_header_can_forge_the_origin_of_samples(
+async def test_no_message_header_can_forge_the_origin_of_samples(
     running: Cluster, parser: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     if parser:
         monkeypatch.setattr(Client, "_process_headers", parser)
-
-    async def live() -> list[StreamMessage]:
-        async with empty_stream(running) as path:
-            for number, headers in enumerate(HOSTILE.values(), 1):
-                text = headers.format(f"log{number}", number, number - 1)
-                say_with(running.urls[0], "samples.evil.log", f"{text}Multidrop-Sequence: {number}\r\n")
-            say_with(running.urls[0], "samples.good.log", "Multidrop-Sequence: 1\r\nMultidrop-Lost: 7\r\n")
-            found: list[StreamMessage] = []
-            while more := await read_after(path, found[-1].place if found else 0, 4, 1 << 20):
-                found += more
-            return found
-
-    found = asyncio.run(live())
+    async with empty_stream(running) as path:
+        for number, headers in enumerate(HOSTILE.values(), 1):
+            text = headers.format(f"log{number}", number, number - 1)
+            say_with(running.urls[0], "samples.evil.log", f"{text}Multidrop-Sequence: {number}\r\n")
+        say_with(running.urls[0], "samples.good.log", "Multidrop-Sequence: 1\r\nMultidrop-Lost: 7\r\n")
+        found: list[StreamMessage] = []
+        while more := await read_after(path, found[-1].place if found else 0, 4, 1 << 20):
+            found += more
     assert [message.place for message in found] == [*range(1, len(HOSTILE) + 2)]
     assert {(message.gateway, message.log) for message in found[:-1]} == {("evil", "log")}
     assert [message.sequence for message in found[:-1]] == [*range(1, len(HOSTILE) + 1)]

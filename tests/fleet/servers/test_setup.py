@@ -263,27 +263,23 @@ async def _check(fleet: Cluster) -> None:
 
 
 @pytest.mark.long
-def test_a_connection_moves_to_another_server_and_returns_home(tmp_path: Path) -> None:
+async def test_a_connection_moves_to_another_server_and_returns_home(tmp_path: Path) -> None:
     with cluster(tmp_path, 3) as three:
-
-        async def main() -> None:
-            path = paths_of(three.urls)[1]
-            await path.open()
-            assert path.server_name == "n2"
-            three.nodes[1].pause()
-            await path.check()
-            assert path.server_name == "n3"
-            three.nodes[1].go_on()
-            await path.check()
-            assert path.server_name == "n2"
-            three.nodes[1].kill()
-            while path.is_open:
-                await asyncio.sleep(0.01)
-            await path.check()
-            assert path.server_name == "n3"
-            await path.close()
-
-        asyncio.run(main())
+        path = paths_of(three.urls)[1]
+        await path.open()
+        assert path.server_name == "n2"
+        three.nodes[1].pause()
+        await path.check()
+        assert path.server_name == "n3"
+        three.nodes[1].go_on()
+        await path.check()
+        assert path.server_name == "n2"
+        three.nodes[1].kill()
+        while path.is_open:
+            await asyncio.sleep(0.01)
+        await path.check()
+        assert path.server_name == "n3"
+        await path.close()
 
 
 @pytest.mark.long

@@ -446,7 +446,7 @@ def test_verbs_are_refused_over_modbus_even_if_the_settings_list_them() -> None:
     assert {rules[verb] for verb in VERBS} == {NEVER_THIS_WAY}
 
 
-def test_concurrent_writes_per_line_are_limited_and_stops_are_not(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_concurrent_writes_per_line_are_limited_but_not_stops(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each write occupies a thread, so a blocked line could otherwise occupy any number of threads."""
     go_on = threading.Event()
 
@@ -454,7 +454,9 @@ def test_concurrent_writes_per_line_are_limited_and_stops_are_not(monkeypatch: p
         assert go_on.wait(PATIENCE)
         return CommandResult(CommandOutcome.DONE, "done")
 
-    async def carry_out() -> None:
+    for work in ("write_register", "carry_out_verb"):
+        monkeypatch.setattr(commands, work, slow)
+    try:
         control = Commands(GuardedLines(), ALL)  # type: ignore[arg-type]
         writer = Caller("anna", "http", "10.0.0.7", Right.WRITE)
         some = [asyncio.ensure_future(control.write("mill", "setpoint", at, writer)) for at in range(8)]
@@ -472,10 +474,5 @@ def test_concurrent_writes_per_line_are_limited_and_stops_are_not(monkeypatch: p
         await asyncio.gather(*some)
         # accepted again, because the earlier writes have ended
         assert (await control.write("mill", "setpoint", 9.0, writer)).ok
-
-    for work in ("write_register", "carry_out_verb"):
-        monkeypatch.setattr(commands, work, slow)
-    try:
-        asyncio.run(carry_out())
     finally:
         go_on.set()
