@@ -28,6 +28,7 @@ from multidrop.drive.verbs import verb
 from multidrop.errors import CancelledByStop, DriveException, LineError, PortLost, Unconfirmed
 from multidrop.families import YD1000, DelixiModbus, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.sim import simulated
+from multidrop.transport import clock
 from multidrop.transport.aside_log import flush
 
 every_family = pytest.mark.parametrize("model", MAKE)
@@ -378,6 +379,30 @@ def test_a_stop_reopens_a_lost_port_unless_a_poller_does(tended: bool) -> None:
     assert not sim.motor.energised
     assert bool(opened) is not tended
     assert all(later - earlier >= 0.5 for earlier, later in pairwise(opened))
+
+
+def test_a_stop_is_sent_as_soon_as_the_poller_has_reopened_the_port(monkeypatch: pytest.MonkeyPatch) -> None:
+    line, (drive,), _ = che_drives(runs_s=0)
+    back_at, begun = line.seconds + 0.05, len(line.frames)
+    sent_at: list[float] = []
+
+    def sleep(seconds: float) -> None:
+        line.sleep(seconds)
+        if line.seconds >= back_at:
+            line.is_lost = False
+            line.bus.note_reopening(False)
+
+    def answer(request: Message) -> None:
+        if line.is_lost:
+            raise PortLost("hall", "it is closed")
+        sent_at.append(line.seconds)
+
+    line.is_lost, line.answers = True, answer
+    line.bus.note_reopening(True)
+    monkeypatch.setattr(clock, "sleep", sleep)
+    drive.stop()
+    assert first(line, begun, STOPS["invt-che"]) == 0
+    assert sent_at[0] - back_at < 0.05
 
 
 def test_a_stop_on_a_closed_port_raises_immediately() -> None:

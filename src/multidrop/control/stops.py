@@ -40,6 +40,7 @@ from multidrop.transport.exchange import WRITE_TIMEOUT, Exchanges
 
 LEAST_S = 30.0  # s; how long a stop is repeated by default
 PAUSE_S = 0.2  # s; pause before a stop is repeated
+LOOK_S = 0.002  # s; pause between checks whether a poller has reopened a lost port
 AT_ONCE = 8  # after this many steps without a good reply, a stop shares the line with polling
 # after a stop's step without a good reply, polling has the line for this multiple of the step's duration
 SHARE = 1.5
@@ -513,6 +514,9 @@ class Stopper:
             return act()
 
     def _regain(self) -> None:
+        given_up_ns = clock.now_ns() + round(PAUSE_S * 1e9)
+        while self.is_reopening and clock.now_ns() < given_up_ns:  # usually takes a few milliseconds
+            clock.sleep(LOOK_S)
         line, now = self._exchanges.line, clock.now_ns()
         if not self.is_reopening and line.is_lost and now >= self._regain_ns and line.may_send:
             self._regain_ns = now + REGAIN_NS
