@@ -89,14 +89,14 @@ class ModbusDevice(Drive):
     def write_holding(
         self,
         start: int,
-        values: Sequence[float],
+        values: float | Sequence[float],
         format: Format = "U16",
         *,
         order: Order = "ABCD",
         confirm: bool = False,
         multiple: bool = False,
     ) -> list[float]:
-        """Write numbers to the holding registers that start at `start`; return what the device then holds.
+        """Write a number or several to the holding registers from `start`; return what the device then holds.
 
         One register is written by function 6, several by function 16, which `multiple` uses for one register
         too. The registers are then read back; if the device refuses that read, the written numbers are
@@ -104,7 +104,8 @@ class ModbusDevice(Drive):
         Raises NotVerified if the device holds other numbers, and Unconfirmed if the write may have happened.
         """
         coding = _coding(format, order)
-        data = b"".join(coding.pack(_raw(value, format, coding)) for value in values)
+        numbers = values if isinstance(values, Sequence) else [values]
+        data = b"".join(coding.pack(_raw(number, format, coding)) for number in numbers)
         words = len(data) // 2
         what = _named("holding register", start, words)
         self._check_write(what, words, _MOST_WORDS, confirm)
@@ -113,7 +114,7 @@ class ModbusDevice(Drive):
         else:
             self.send_raw(16, start, data, count=words)
         held = self._read_back(what, 3, start, words) or data
-        found = list(_decoded(held, coding, len(values)))
+        found = list(_decoded(held, coding, len(numbers)))
         if held != data:
             raise NotVerified(self.name, what, f"the device holds {found}")
         return [float("nan") if number is None else number for number in found]
@@ -138,27 +139,28 @@ class ModbusDevice(Drive):
         return held
 
     def write_coils(
-        self, start: int, values: Sequence[bool], *, confirm: bool = False, multiple: bool = False
+        self, start: int, values: bool | Sequence[bool], *, confirm: bool = False, multiple: bool = False
     ) -> list[bool]:
-        """Write coils from `start`, and return the coils that the device then holds.
+        """Write a coil or several from `start`, and return the coils that the device then holds.
 
         If the device refuses to be read back, the written coils are returned. Raises as `write_holding`.
 
         One coil is written by function 5, several by function 15, which `multiple` uses for one coil too.
         """
-        for value in values:
-            if value not in (True, False):
-                raise TypeError(f"a coil is True or False, not {value!r}")
-        count = len(values)
+        coils = values if isinstance(values, Sequence) else [values]
+        for coil in coils:
+            if coil not in (True, False):
+                raise TypeError(f"a coil is True or False, not {coil!r}")
+        count = len(coils)
         what = _named("coil", start, count)
         self._check_write(what, count, _MOST_COILS, confirm)
-        bits = sum(bool(value) << at for at, value in enumerate(values)).to_bytes((count + 7) // 8, "little")
+        bits = sum(bool(coil) << at for at, coil in enumerate(coils)).to_bytes((count + 7) // 8, "little")
         if count == 1 and not multiple:
-            self.send_raw(5, start, b"\xff\x00" if values[0] else b"\x00\x00")
+            self.send_raw(5, start, b"\xff\x00" if coils[0] else b"\x00\x00")
         else:
             self.send_raw(15, start, bits, count=count)
         held = [*_bits_of(self._read_back(what, 1, start, count) or bits, count)]
-        if held != [bool(value) for value in values]:
+        if held != [bool(coil) for coil in coils]:
             raise NotVerified(self.name, what, f"the device holds {held}")
         return held
 
@@ -217,6 +219,8 @@ def _parts(start: int, count: int, most: int, words: int) -> Iterator[tuple[int,
     """Yield the start address and the number of values of each request that reads `count` values."""
     if not is_whole(count) or count < 1:
         raise ValueError(f"count = {count!r} is not 1 or more")
+    if not is_whole(start):
+        raise TypeError(f"start = {start!r} is not a whole number")
     for done in range(0, count, most):
         yield start + done * words, min(most, count - done)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from typing import Any
 
 import pytest
 from checksums import rtu
@@ -77,6 +78,20 @@ def test_modbus_device_reads_back_the_registers_that_it_wrote(meter: BusAndDevic
     assert device.write_holding(5, [1, 2], confirm=True) == [1, 2]
     assert (line.sims[0]["first"], line.sims[0]["second"]) == (1, 2)
     assert [request.function for request, _ in line.frames] == [6, 3, 16, 3]
+
+
+def test_a_number_and_a_coil_are_written_without_a_list(meter: BusAndDevice) -> None:
+    _, device = meter
+    assert device.write_holding(5, 7, confirm=True) == [7]
+    assert device.write_coils(3, True, confirm=True) == [True]
+    assert device.read_coils(3) == [True]
+
+
+def test_a_start_that_is_no_number_is_refused_in_one_sentence(meter: BusAndDevice) -> None:
+    _, device = meter
+    wrong: Any = "5"
+    with pytest.raises(TypeError, match="start = '5' is not a whole number"):
+        device.read_holding(wrong)
 
 
 def test_argument_multiple_writes_one_number_with_function_10h(meter: BusAndDevice) -> None:
