@@ -189,8 +189,8 @@ TWENTY_MISTAKES = [
     "twenty.toml:3: [family]: unknown key 'manuel'; did you mean manual?",
     "twenty.toml:8: [family]: silence = 'soon' is not a duration from 100 us to 24 h, such as \"50 ms\", "
     '"2 s" or "1 min"',
-    "twenty.toml:6: [family]: addresses = [1, 300]: it must be the first and the last address, from 1 to 247 "
-    "(0 to 255 on Modbus TCP); write addresses = [1, 247]",
+    "twenty.toml:6: [family]: addresses = [1, 300]: this must be the first and the last address, from 1 to "
+    "247 (0 to 255 on Modbus TCP); write addresses = [1, 247]",
     "twenty.toml:4: [family]: baudrates = [9600, 'fast']: 'fast' is not a baud rate; "
     "write baudrates = [9600, 19200]",
     "twenty.toml:7: [family]: together: holding = 200 is not 1 to 125 registers in one read",
@@ -209,11 +209,11 @@ TWENTY_MISTAKES = [
     "twenty.toml:21: [reading] flags: bits: b = 99 is not a bit's number, 0 to 63",
     "twenty.toml:22: [reading] both: values and unit are both given; a register has only one of unit, values "
     "and bits",
-    "twenty.toml:25: [setting] limit: span = [50, 0]: it is in the wrong order: give the smallest first; "
-    "write span = [0, 50]",
+    "twenty.toml:25: [setting] limit: span = [50, 0]: the value is in the wrong order: give the smallest "
+    "first; write span = [0, 50]",
     "twenty.toml:27: [setting] speed: speed is declared twice, first in [reading] speed; "
     "every register has its own name",
-    "twenty.toml:28: [setting] gain: while_running = 'no': it is neither true nor false; "
+    "twenty.toml:28: [setting] gain: while_running = 'no': the value is neither true nor false; "
     "write while_running = false",
     "twenty.csv: line 2, column step: '0,1' has a decimal comma; write 0.1",
     "twenty.csv: line 2, an: at: 1E10 is a power of ten, into which a spreadsheet has converted a hex "
@@ -282,15 +282,15 @@ def test_mistakes_in_identify_or_verb_are_reported(tmp_path: Path, section: str,
 
 WRONG_KEYS = [  # each text has one wrong key of a register
     ("harmless = [0]", "[reading] a: a reading is never written"),
-    ("step = inf", "step = inf: it is not a finite number; write step = 0.1"),
-    ("step = 0", "step = 0: it makes every value 0; write step = 0.1"),
-    ("number_format = 'F31'", "number_format = 'F31': it is not known; did you mean"),
+    ("step = inf", "step = inf: the value is not a finite number; write step = 0.1"),
+    ("step = 0", "step = 0: the value makes every value 0; write step = 0.1"),
+    ("number_format = 'F31'", "number_format = 'F31': the value is not known; did you mean"),
     ("values = {}", "values is empty; leave it out"),
     (
         "title.de = 'Strom'",
         "title = {'de': 'Strom'}: it has the unknown language de, not one of ru, zh; write title.ru",
     ),
-    ("title = 'ток'", "title = 'ток': it is not a table of titles by language"),
+    ("title = 'ток'", "title = 'ток': the value is not a table of titles by language"),
     ("title.ru = ''", "has a title of 0 characters, not 1 to 100"),
     ("bits = { real = 0 }", "'real' is a name that all enumerations"),
     ("bits = { On = 0, on = 1 }", "on and On differ in capitals alone"),

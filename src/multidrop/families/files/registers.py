@@ -134,19 +134,19 @@ def _any(value: Any) -> Any:
 
 def _text(value: Any) -> str:
     if not isinstance(value, str):
-        raise ValueError("it is not a text")
+        raise ValueError("the value is not a text")
     if not value.isprintable():
-        raise ValueError("it has unprintable characters; remove them")
+        raise ValueError("the value has unprintable characters; remove them")
     if len(value) > LONGEST_TEXT:
-        raise ValueError(f"it has more than {LONGEST_TEXT} characters")
+        raise ValueError(f"the value has more than {LONGEST_TEXT} characters")
     return value
 
 
 def _number(value: Any) -> float:
     if not is_number(value):
-        raise ValueError("it is not a number")
+        raise ValueError("the value is not a number")
     if not math.isfinite(value):
-        raise ValueError("it is not a finite number")
+        raise ValueError("the value is not a finite number")
     return value
 
 
@@ -154,37 +154,37 @@ def _step(value: Any) -> Any:
     if value == NOT_STATED:
         return None
     if _number(value) == 0:
-        raise ValueError("it makes every value 0")
+        raise ValueError("the value makes every value 0")
     return value
 
 
 def _truth(value: Any) -> bool:
     if not isinstance(value, bool):
-        raise ValueError("it is neither true nor false")
+        raise ValueError("the value is neither true nor false")
     return value
 
 
 def _span(value: Any) -> tuple[float, float]:
     if not isinstance(value, list) or len(value) != 2:
-        raise ValueError("it is not two numbers")
+        raise ValueError("the value is not two numbers")
     low, high = map(_number, value)
     if low > high:
-        raise ValueError("it is in the wrong order: give the smallest first")
+        raise ValueError("the value is in the wrong order: give the smallest first")
     return low, high
 
 
 def _counts(value: Any) -> tuple[int, ...]:
     if not isinstance(value, list) or any(type(each) is not int for each in value):
-        raise ValueError("it is not a list of raw counts")
+        raise ValueError("the value is not a list of raw counts")
     if len(value) > MOST_LISTED:
-        raise ValueError(f"it has more than {MOST_LISTED} counts")
+        raise ValueError(f"the value has more than {MOST_LISTED} counts")
     return tuple(value)
 
 
 def _invalid(value: Any) -> tuple[float, ...]:
     listed = value if isinstance(value, list) else [value]
     if not listed or len(listed) > MOST_LISTED:
-        raise ValueError(f"it is not 1 to {MOST_LISTED} raw counts")
+        raise ValueError(f"the value is not 1 to {MOST_LISTED} raw counts")
     return tuple(math.nan if each in ("NaN", "nan") else _number(each) for each in listed)
 
 
@@ -192,10 +192,10 @@ def _part(value: Any) -> tuple[int, int]:
     first, dash, last = str(value).partition("-")
     ends = [end.strip() for end in (first, last if dash else first)]
     if isinstance(value, (bool, float)) or not all(end.isascii() and end.isdecimal() for end in ends):
-        raise ValueError("it is neither a bit nor the first and the last of several bits")
+        raise ValueError("the value is neither a bit nor the first and the last of several bits")
     low, high = (int(end[:4]) for end in ends)
     if low > high:
-        raise ValueError("it is in the wrong order: give the lowest bit first")
+        raise ValueError("the value is in the wrong order: give the lowest bit first")
     return low, high
 
 
@@ -207,7 +207,7 @@ def _named_one(known: Mapping[str, Any], spelling: Callable[[str], str], value: 
     name = spelling(value) if isinstance(value, str) else ""
     if name in known:
         return known[name]
-    raise ValueError(f"it is not known; {did_you_mean(name, known)}")
+    raise ValueError(f"the value is not known; {did_you_mean(name, known)}")
 
 
 def _spellings(known: Mapping[str, Any], spelling: Callable[[str], str]) -> list[str]:
@@ -217,20 +217,20 @@ def _spellings(known: Mapping[str, Any], spelling: Callable[[str], str]) -> list
 
 def _named(value: Any) -> Mapping[str, Any]:
     if not isinstance(value, dict):
-        raise ValueError("it must be a table of names and numbers, such as { off = 0, on = 1 }")
+        raise ValueError("the value must be a table of names and numbers, such as { off = 0, on = 1 }")
     return value
 
 
 def _titles(value: Any) -> Mapping[str, str]:
     if not isinstance(value, dict) or not value:
-        raise ValueError("it is not a table of titles by language")
+        raise ValueError("the value is not a table of titles by language")
     for language, title in value.items():
         if language not in LANGUAGES:
             raise ValueError(
                 f"it has the unknown language {language[:20]}, not one of {', '.join(LANGUAGES)}"
             )
         if not 1 <= len(_text(title)) <= LONGEST_TITLE:
-            raise ValueError(f"it has a title of {len(title)} characters, not 1 to {LONGEST_TITLE}")
+            raise ValueError(f"the value has a title of {len(title)} characters, not 1 to {LONGEST_TITLE}")
     return value
 
 
