@@ -18,14 +18,14 @@ from stop_frames import STOPS, Meanwhile, Own, che_drives, first, plain_stop, st
 
 from multidrop.control.commands import stop_drive
 from multidrop.control.eeprom_ledger import Ledger
-from multidrop.control.outcome import Seen
+from multidrop.control.outcome import UNSEEN, Seen
 from multidrop.control.ramp import ramp, start_staggered
 from multidrop.control.stops import AT_ONCE, LEAST_S, PAUSE_S
 from multidrop.core import Completion, Exchange, Message
 from multidrop.drive import Condition, Drive, Script, read, wait, write
 from multidrop.drive.register import reading
 from multidrop.drive.verbs import verb
-from multidrop.errors import CancelledByStop, DriveException, LineError, PortLost, Unconfirmed
+from multidrop.errors import BusError, CancelledByStop, DriveException, LineError, PortLost, Unconfirmed
 from multidrop.families import YD1000, DelixiModbus, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.sim import simulated
 from multidrop.transport import clock
@@ -413,6 +413,37 @@ def test_a_stop_on_a_closed_port_raises_immediately() -> None:
     with pytest.raises(LineError, match="it is closed"):
         drive.stop()
     assert line.seconds - begun < 0.1
+
+
+class Careless(Own):
+    """A drive whose stop ignores every failure."""
+
+    @verb
+    def stop(self) -> Script[None]:
+        """Stop the motor."""
+        with suppress(BusError):
+            yield from write(self.run, 0)
+
+
+@pytest.mark.parametrize("failure", [PortLost("hall", "unplugged"), None])
+def test_a_stop_whose_script_ignores_failures_is_not_reported_as_done(failure: BaseException | None) -> None:
+    """The stop is repeated, although its script has ended."""
+    line = SimulatedBus(simulated(Careless(1)))
+    drive = line.attach(Careless(1))
+    line.fails, line.loses = lambda request: failure, lambda request: True
+    found = line.bus.stop_all(seconds=2)
+    assert found[drive.name].seen is (Seen.FAILED if failure else Seen.SENT)
+    assert "the drive has confirmed no write" in found[drive.name].why
+    assert failure or len(writes(line)) > 2
+    line.fails, line.loses = lambda request: None, lambda request: False
+    assert drive.stop().ok
+
+
+def test_a_stop_without_a_read_is_not_reported_as_seen() -> None:
+    line = SimulatedBus(simulated(Own(1)))
+    drive = line.attach(Own(1))
+    assert drive.stop().text == f"stopped: {UNSEEN}"
+    assert str(line.bus.stop_all()[drive.name]).endswith(f"stopped after 0.0 s: {UNSEEN}")
 
 
 def test_a_stop_is_sent_without_a_writable_ledger(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -77,6 +77,10 @@ class Seen(Enum):
     NO_MOTOR = "has no motor"  # no stop was sent, because the device has no motor
 
 
+# the reason in the result of a stop whose script reads nothing after its last write
+UNSEEN = "confirmed, but not seen to stand"
+
+
 @dataclass(frozen=True)
 class Stopped:
     """The result of one drive's stop, its duration in s, and why the motor was not seen to stop."""
@@ -88,7 +92,10 @@ class Stopped:
 
     @property
     def ok(self) -> bool:
-        """True if the motor was seen to be at rest, or the device has no motor."""
+        """True if the motor was seen to be at rest, or the device has no motor.
+
+        Also True if the script of a drive of your own reads nothing that shows whether the motor is at rest.
+        """
         return self.seen in (Seen.STOPPED, Seen.NO_MOTOR)
 
     def __str__(self) -> str:
@@ -144,6 +151,8 @@ def result_of_stop(stopped: Stopped) -> CommandResult:
     outcome = _STOP_OUTCOMES[stopped.seen]
     if stopped.seen is Seen.NO_MOTOR:
         return CommandResult(outcome, stopped.seen.value)
+    if outcome is CommandOutcome.DONE and stopped.why:
+        return CommandResult(outcome, f"stopped: {stopped.why}")
     if outcome is CommandOutcome.DONE:
         return CommandResult(outcome, f"stopped: seen to stand after {stopped.seconds:.1f} s")
     return CommandResult(outcome, f"{stopped.seen.value}: {stopped.why}", BusError(stopped.why))

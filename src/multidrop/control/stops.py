@@ -15,7 +15,7 @@ from numbers import Real
 from typing import Any, TypeVar
 
 from multidrop.control.call import Latches
-from multidrop.control.outcome import Outcome, Seen, Stopped, result_of_stop
+from multidrop.control.outcome import UNSEEN, Outcome, Seen, Stopped, result_of_stop
 from multidrop.control.writer import Checked, Writer
 from multidrop.core import Message
 from multidrop.drive.family import Drive
@@ -92,6 +92,7 @@ class StopAttempt:
         self.frame: Message | None = None  # the newest request of this stop
         self._times_in_doubt = 0  # number of frames that may or may not have been sent
         self._is_confirmed = False
+        self._is_read = False  # whether the drive has answered a read since the last write
         self._pulses: set[tuple[str, Any]] = set()
         self._has_warned = False
         self.doubt = ""  # why the drive may be of another family
@@ -135,8 +136,12 @@ class StopAttempt:
                 if not is_answered:
                     self._share_line(begun, now())
         except StopIteration:
-            self.failure = self._unproven()
-            return True
+            if self._is_confirmed or self._is_read:
+                self.failure = self._unproven()
+                return True
+            reason = "its script ended, although the drive has confirmed no write and answered no read"
+            self.failure = Unconfirmed(self.drive.name, "the stop", reason)
+            return not self._goes_on(self.failure, now())
         except Exception as failure:  # a user's own script may raise anything
             self.failure = failure
             return not self._goes_on(failure, now())
@@ -209,15 +214,16 @@ class StopAttempt:
             raise
         else:
             self._note(step, None)
-            if isinstance(step, Read) and result != 0:
-                self._shows_more_than_zeros = True
+            if isinstance(step, Read):
+                self._is_read = True
+                self._shows_more_than_zeros |= result != 0
             self._resume = lambda: script.send(result)
         return True
 
     def _note(self, step: Step, failure: Exception | None) -> None:
         if not isinstance(step, Write):
             return
-        self._shows_more_than_zeros = False
+        self._shows_more_than_zeros = self._is_read = False
         if not isinstance(failure, UNSENT):
             self.times_sent += 1
             if isinstance(step, Pulse):
@@ -281,7 +287,7 @@ class StopAttempt:
     def result(self) -> Stopped:
         known, seconds = self.known, self.ended - self._begun
         if known is None:
-            return Stopped(self.drive.name, Seen.STOPPED, seconds)
+            return Stopped(self.drive.name, Seen.STOPPED, seconds, "" if self._is_read else UNSEEN)
         if isinstance(known, Unsupported) or not (self.is_sent or self.times_sent):
             seen = Seen.FAILED
         else:
