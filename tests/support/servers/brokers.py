@@ -250,13 +250,11 @@ class RecordedCommands:
     def stopped_ns(self, drive: str) -> int | None:
         return self.stopped_at.get(drive)
 
-    async def write(self, drive: str, register: str, value: float, caller: Caller) -> CommandResult:
+    async def write(self, drive: str, register: str, value: float, *_: object) -> CommandResult:
         self.noted.append(("write", drive, register, value))
         return CommandResult(CommandOutcome.DONE, "done")
 
-    async def act(
-        self, drive: str, verb: str, options: Mapping[str, object], caller: Caller
-    ) -> CommandResult:
+    async def act(self, drive: str, verb: str, options: Mapping[str, object], *_: object) -> CommandResult:
         self.noted.append(("act", drive, verb, dict(options)))
         return CommandResult(CommandOutcome.DONE, "done")
 
