@@ -258,9 +258,7 @@ def test_start_writes_the_setpoint_first(run: Run, port: str, toy: SimulatedDriv
 
 
 @pytest.mark.parametrize("at", ["opening", "setpoint", "reading"])
-def test_a_start_is_not_sent_if_the_process_was_suspended_before_it(
-    run: Run, monkeypatch: pytest.MonkeyPatch, at: str
-) -> None:
+def test_a_suspended_process_sends_no_start(run: Run, monkeypatch: pytest.MonkeyPatch, at: str) -> None:
     """The user may press Ctrl-Z during the command, and continue it hours later."""
     sim = simulated(InvtCHE(1, maximum_frequency=50))
     assert isinstance(sim, MotorDrive)

@@ -197,9 +197,7 @@ def test_an_unidentifiable_drive_is_commanded_only_if_confirmed(run: Run, plant:
 
 
 @pytest.mark.parametrize(("there", "is_started"), [(Toy(4), False), (InvtCHE(4, maximum_frequency=50), True)])
-def test_a_start_writes_nothing_to_a_drive_of_another_family(
-    run: Run, plant: Path, there: Drive, is_started: bool
-) -> None:
+def test_a_start_is_not_sent_to_another_family(run: Run, plant: Path, there: Drive, is_started: bool) -> None:
     plant.write_text(plant.read_text().replace("address = 4\n", "address = 4\nmaximum_frequency = 50\n"))
     sim = simulated(there)
     with Simulator([Wire([sim], unpaced=True)]) as simulator:
@@ -305,9 +303,7 @@ def test_models_are_found_relative_to_the_plant_file(
     assert (status, out) == (0, "output_current  3.25  A\n")
 
 
-def test_writes_to_a_drive_named_by_plant_file_are_refused_as_if_named_by_port(
-    run: Run, plant: Path, at: str, port: str
-) -> None:
+def test_plant_files_do_not_alter_which_writes_are_refused(run: Run, plant: Path, at: str, port: str) -> None:
     """Each command names the drive first by plant file, then by port. The errors must be equal."""
     for command, further in (
         ("write", ("control", "RUNNING", "--yes")),

@@ -141,23 +141,15 @@ def test_a_recording_in_segments_must_be_named_by_a_segment(run: Run, tmp_path: 
         (["--rotate", "soon"], "invalid time 'soon': write 1 s to 100 years"),
         (["--most", "big"], "invalid size 'big': write 1 kB or more"),
         (["--trigger", "pump-1.output_current", *OUT], "--trigger pump-1.output_current: column 1: "),
-        (
-            ["--trigger", "output_current > 30", *OUT],
-            "output_current has no drive; write it as pump-1.",
-        ),
+        (["--trigger", "output_current > 30", *OUT], "output_current has no drive; write it as pump-1."),
         (["--trigger", "key"], "--trigger needs --out"),
         (["--trigger", "key", *OUT, "--rotate", "1 h"], "--trigger and --rotate exclude each other"),
-        (
-            ["--trigger", "key", "--out", "a.txt"],
-            "a.txt: a recording's name must end in .arrows",
-        ),
+        (["--trigger", "key", "--out", "a.txt"], "a.txt: a recording's name must end in .arrows"),
         (["--trigger", "key", *OUT], "--trigger key needs a terminal and excludes --json"),
         (["--pre", "1 s"], "--pre and --post belong to a trigger"),
     ],
 )
-def test_invalid_segment_and_trigger_options_are_named(
-    run: Run, plant: Path, words: list[str], sentence: str
-) -> None:
+def test_invalid_recording_options_are_named(run: Run, plant: Path, words: list[str], sentence: str) -> None:
     status, out, told = run("poll", plant, *words)
     assert (status, out) == (2, "")
     assert sentence in told

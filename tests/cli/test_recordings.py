@@ -73,9 +73,7 @@ def test_series_without_values_are_not_plotted(run: Run, tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("command", ["plot", "report", "convert"])
-def test_the_folder_of_a_history_as_argument_prints_one_sentence(
-    run: Run, tmp_path: Path, command: str
-) -> None:
+def test_a_history_folder_as_argument_prints_one_sentence(run: Run, tmp_path: Path, command: str) -> None:
     out = () if command != "convert" else (tmp_path / "all.csv",)
     folder = f"multidrop: {tmp_path} is the folder of a history: name one of its files, such as"
     by_program = "or read it from Python with `multidrop.History`\n"

@@ -137,9 +137,7 @@ async def test_closing_lines_cancels_their_timer(tmp_path: Path, monkeypatch: py
         gateway.mastership.end()
 
 
-async def test_lines_that_fail_to_close_keep_their_timer_and_the_lock(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_unclosed_lines_keep_timer_and_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The process could still send, so no other process may believe that it is dead."""
     gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
     gateway.mastership.extend(time.clock_gettime_ns(time.CLOCK_BOOTTIME) + 3600 * 10**9)

@@ -340,9 +340,7 @@ def test_many_stops_of_a_silent_drive_do_not_delay_the_stop_of_another(gateway: 
 
 
 @pytest.mark.slow
-def test_of_many_coasts_of_a_silent_drive_only_one_is_repeated(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_one_of_many_coasts_is_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     repeated: list[float | None] = []
     stop = commands.stop_drive_by
 

@@ -254,9 +254,7 @@ NEW_FAN = InvtCHE(2, name="fan")
 
 
 @pytest.mark.parametrize("names", [["fan"], None])
-async def test_a_new_drive_is_stopped_while_its_predecessor_is_still_being_stopped(
-    names: list[str] | None,
-) -> None:
+async def test_a_new_drive_is_stopped_while_its_predecessor_is_being_stopped(names: list[str] | None) -> None:
     """The stop of the replaced drive may take half a minute, for example if that drive is silent."""
     silent = asyncio.Event()
     lines = Lines(plant_of(PUMP, FAN), held={FAN.address: silent})

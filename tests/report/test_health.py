@@ -252,9 +252,7 @@ def test_a_line_whose_registers_have_polling_rates_has_no_bus_cycle(
     assert "bus cycle" not in report_page(look)
 
 
-def test_a_plan_without_polling_rates_is_left_out(
-    planned: dict[str, Any], turns: list[Row], tmp_path: Path
-) -> None:
+def test_a_plan_without_rates_is_left_out(planned: dict[str, Any], turns: list[Row], tmp_path: Path) -> None:
     del planned["hall-1"]["drives"]["fan"]["blocks"][0]["every_ms"]
     look = load(record(tmp_path / "it.arrows", turns, ABOUT | {"planned": planned}))
     assert line_uses(look) == []

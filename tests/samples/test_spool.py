@@ -255,9 +255,7 @@ def test_rows_removed_while_the_streams_position_is_unknown_are_counted_later(
     spool.close()
 
 
-def test_rows_appended_to_a_closed_spool_are_lost_for_that_reason(
-    spool: Spool, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_rows_appended_to_a_closed_spool_are_lost(spool: Spool, caplog: pytest.LogCaptureFixture) -> None:
     spool.close()
     spool.append(numbered(0, 5))
     assert spool.state().lost == 50
@@ -359,9 +357,7 @@ def test_a_hanging_disk_does_not_delay_the_poller(spool: Spool, monkeypatch: pyt
     assert spool.sync(30.0)
 
 
-def test_rows_counted_as_lost_are_not_written(
-    spool: Spool, folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_lost_rows_are_not_written_later(spool: Spool, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     really = RowBuffer.messages
 
     def messages(self: RowBuffer, **options: Any) -> Iterator[Packed]:

@@ -294,9 +294,7 @@ def test_a_full_disk_blocks_commands_but_not_stops(tmp_path: Path) -> None:
     assert path.asked == ["stop"]
 
 
-def test_a_hanging_disk_blocks_commands_but_delays_no_stop(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_hanging_disk_blocks_commands_but_no_stop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     disk = threading.Event()
     path = ScriptedPath(cmd=[OFFER], do=[IT_IS_DONE], stop=[IT_IS_DONE])
     monkeypatch.setattr(CommandLog, "_add", lambda *record: disk.wait())

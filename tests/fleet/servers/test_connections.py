@@ -31,14 +31,12 @@ REQUEST = Request("questions", b"")
 class SlowPath:
     """A fake server connection that answers its requests after these delays in s, or fails."""
 
-    def __init__(
-        self, name: str, *delays: float, failure: FleetError | None = None, pause: float = 0
-    ) -> None:
+    def __init__(self, name: str, *delays: float, failure: FleetError | None = None, gap: float = 0) -> None:
         self.name = name
         self.asked: list[float] = []
         self._delays = [*delays]
         self._failure = failure
-        self._pause = pause  # pause between two messages, in s
+        self._gap = gap  # pause between two messages, in s
         self.under_way = 0
 
     async def gather(self, request: Request, get: DirectGet) -> None:
@@ -51,7 +49,7 @@ class SlowPath:
                     raise self._failure
                 get.messages.append(DirectMessage(self.name, number, b""))
                 get.count += 1
-                await asyncio.sleep(self._pause)
+                await asyncio.sleep(self._gap)
         finally:
             self.under_way -= 1
 
@@ -98,7 +96,7 @@ async def test_a_late_answer_to_the_first_request_is_used_even_after_a_repeat() 
 
 
 async def test_a_long_answer_is_not_requested_again_while_parts_arrive() -> None:
-    paths = [SlowPath("a", 0.01, pause=0.09), SlowPath("b", 0.01)]
+    paths = [SlowPath("a", 0.01, gap=0.09), SlowPath("b", 0.01)]
     assert await answer(*paths) == ("a", 0.28)
     assert asked(paths) == [[0.0], []]
 

@@ -201,9 +201,7 @@ def get(gateway: Any, path: str) -> Any:
 @pytest.mark.parametrize(
     ("passing", "master"), [("off", "pymodbus"), *usually(*(("declared", name) for name in MASTERS))]
 )
-def test_values_read_by_the_address_map_equal_those_of_the_page(
-    tmp_path: Path, passing: str, master: str
-) -> None:
+def test_values_by_the_address_map_equal_those_of_the_page(tmp_path: Path, passing: str, master: str) -> None:
     with served(tmp_path, passing) as (gateway, _), closing(Client(master, tmp_path)) as client:
         rows = get(gateway, "/api/modbus-map")
         until(lambda: None not in [one[0] for drive in values(gateway).values() for one in drive.values()])

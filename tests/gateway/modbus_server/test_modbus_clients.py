@@ -203,9 +203,7 @@ async def test_writes_start_on_arrival_and_in_their_order(is_stalled: bool) -> N
 
 
 @pytest.mark.parametrize("frames", [reads, writes])
-async def test_slow_answers_to_a_client_are_sent_in_several_turns(
-    frames: Callable[[int, int], bytes],
-) -> None:
+async def test_slow_answers_to_a_client_are_sent_in_turns(frames: Callable[[int, int], bytes]) -> None:
     client, transport = connected(port_of(slowly))
     client.data_received(frames(0, 100))
     assert len(transactions(transport.written)) < 10

@@ -364,9 +364,7 @@ async def test_concurrent_commands_from_a_broker_are_limited_and_stops_are_not()
     assert commands.begun[-1] == 99.0
 
 
-async def test_a_command_is_not_sent_after_its_age_limit(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+async def test_a_command_is_not_sent_after_its_age_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     """The process may be suspended after the command's age was checked."""
     monkeypatch.setattr(broker_commands, "boottime_ns", lambda: 100 * 10**9)
     commands: Any = HeldCommands()

@@ -158,9 +158,7 @@ def test_a_failing_publisher_is_offline_after_a_reconnection_too(listener: Liste
 
 
 @pytest.mark.slow
-def test_publishing_does_not_wait_for_a_frozen_broker(
-    broker: Broker, listener: Listener, start: Start
-) -> None:
+def test_publishing_never_waits_for_a_frozen_broker(broker: Broker, listener: Listener, start: Start) -> None:
     known, running = start()
     listener.wait_for(has(f"multidrop/{FAN.name}/available", b"online"))
     broker.signal(signal.SIGSTOP)
@@ -217,9 +215,7 @@ def test_a_recent_write_is_carried_out_once(broker: Broker, listener: Listener, 
 
 
 @pytest.mark.parametrize("age_ms", [60_000, -60_000])
-def test_a_delayed_command_is_refused(
-    broker: Broker, listener: Listener, commanded: Any, age_ms: int
-) -> None:
+def test_a_late_command_is_refused(broker: Broker, listener: Listener, commanded: Any, age_ms: int) -> None:
     sent_ms = now_ms() - age_ms
     publish(broker, "multidrop/pump-1/set/setpoint", write_of(25, sent_ms))
     assert "s ago by the clocks of sender and gateway" in told(listener)["text"]
