@@ -437,10 +437,7 @@ BIG_ENDIAN_SECTION = struct.pack(">IIIHHqI", 0x0A0D0D0A, 28, 0x1A2B3C4D, 1, 0, -
         ),
         (described() + packet(1, READ), NO_PACKET),  # the file has no interface 1
         (described() + packet(0, READ, stated=9), NO_PACKET),  # its stated length exceeds the block
-        (
-            described() + packet(0, READ)[:-4] + bytes(4),
-            NO_PACKET,
-        ),  # the length at its block's end differs
+        (described() + packet(0, READ)[:-4] + bytes(4), NO_PACKET),  # its block ends with another length
         (
             described() + SECTION,
             ": byte 48: a second section starts here, and only the first one can be read",

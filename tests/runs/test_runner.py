@@ -143,10 +143,7 @@ def test_an_abort_stops_all_drives_and_says_why(kind: str, tmp_path: Path) -> No
         happened: list[bool] = []
 
         def happen(rows: object) -> None:
-            quiet = {
-                "fault": "steps 1",
-                "silence": "hold",
-            }  # else a command fails first
+            quiet = {"fault": "steps 1", "silence": "hold"}  # elsewhere a command would fail first
             is_due = test.phase == quiet.get(kind, test.phase)
             if sims[0].motor.energised and is_due and not happened:
                 happened.append(True)
