@@ -64,7 +64,7 @@ TROUBLE = {  # the faults that some drives of the demo simulate
     "fan-3": "loss = 0.02",
 }
 DRIFT = 0.25  # each simulated load moves up and down by this fraction of the rated torque
-FIRST_STEP_S = 0.25  # pause between the first starts of a line's motors
+FIRST_STEP_S = 0.5  # pause between the first starts of a line's motors
 STEP_S = 0.8  # pause before the operator turns to the next drive of a line
 CALM = 3  # when the operator visits a running motor, one visit in CALM changes the setpoint, on average
 
