@@ -437,3 +437,17 @@ def test_live_values_have_the_time_of_their_poll(host: Host, row_node: tuple[Any
     running.step()
     [metric] = host.wait_for("DDATA", "pump-1").metrics
     assert (metric.timestamp, metric.is_historical) == (7, False)
+
+
+def test_a_reload_without_a_connection_sends_births_of_changed_drives(tmp_path: Path) -> None:
+    """The part publishes without a connection too; the outbox keeps the newest message of each topic."""
+    known = inside(tmp_path)
+    node = SparkplugNode(MqttSettings(sparkplug="works", node="line"), known, lambda: 7)
+    node.outbox = Outbox(lambda message: None)
+    node.publish()
+    more = known.hub.polled("pump-1")
+    known.hub.polled = lambda drive: (*more, InvtCHE.output_current) if drive == "pump-1" else ()
+    known.hub.values["pump-1", "output_current"] = 3.0
+    node.adopt(known.plant)
+    node.publish()
+    assert node._sent["pump-1"]["output_current"] == 3.0

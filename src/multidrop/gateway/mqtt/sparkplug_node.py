@@ -108,8 +108,9 @@ class SparkplugNode:
         """Use another plant, and send the deaths of drives that it lacks."""
         self._plant = plant
         for drive in self._sent.keys() - drives_of(plant).keys():
-            del self._sent[drive]
             self._replace_pending(drive, "DDEATH", self._device_death)
+        self._sent.clear()  # the drives that stay may have other registers: send their births again
+        self._changed.clear()
 
     def publish(self) -> None:
         """Send changed values, and births and deaths of drives."""
