@@ -585,7 +585,7 @@ def test_a_stop_is_sent_even_if_a_log_handler_hangs(monkeypatch: pytest.MonkeyPa
 
 
 def noting(line: SimulatedBus) -> list[str]:
-    """Return a list that gets the texts of `stops_under_way` at each request, without repetitions."""
+    """Return a list to which each request appends the present texts of `stops_under_way`."""
     told: list[str] = []
 
     def note(request: Message) -> bool:

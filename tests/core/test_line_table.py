@@ -79,7 +79,7 @@ class Walk:
         self.peer = Peer(least_timeout=0.02, most_timeout=0.3)
         self.rest = b""  # second piece of a reply, not yet received
         often = [self.begin, self.want, self.want, self.take, self.answer, self.wait]
-        self.steps = [*often * (1 + seed % 2 * 9), self.noise, self.abandon]  # odd seeds: rare noise
+        self.steps = [*often * (1 + seed % 2 * 9), self.noise, self.abandon]  # noise is rarer with odd seeds
 
     def run(self, steps: int) -> Iterator[tuple[int, int]]:
         """Yield the state before and after each step."""

@@ -16,8 +16,8 @@ from multidrop.families.delixi import (
     DelixiRunSource,
 )
 
-FORWARD = {Framing.RTU: "01 06 20 00 00 12 02 07", Framing.ASCII: ":010620000012C7"}  # printed
-FIFTY = {Framing.RTU: "01 06 00 02 13 88 25 5C", Framing.ASCII: ":0106000213885C"}  # printed
+FORWARD = {Framing.RTU: "01 06 20 00 00 12 02 07", Framing.ASCII: ":010620000012C7"}  # printed in its manual
+FIFTY = {Framing.RTU: "01 06 00 02 13 88 25 5C", Framing.ASCII: ":0106000213885C"}  # printed in its manual
 STOP = {Framing.RTU: "01 06 20 00 00 01 43 CA", Framing.ASCII: ":010620000001D8"}
 REVERSE = {Framing.RTU: "01 06 20 00 00 22 02 13", Framing.ASCII: ":010620000022B7"}
 

@@ -24,9 +24,9 @@ from multidrop.families.delixi import (
     parameter,
 )
 
-FORWARD = ":010200020000000005"  # printed
-FIFTY = ":0104000100001388A1"  # printed
-FIFTY_STORED = ":0106000200001388A4"  # printed
+FORWARD = ":010200020000000005"  # printed in the document
+FIFTY = ":0104000100001388A1"  # printed in the document
+FIFTY_STORED = ":0106000200001388A4"  # printed in the document
 STOP = ":010200010000000004"
 REVERSE = ":010200030000000006"
 RESET = ":010200040000000007"

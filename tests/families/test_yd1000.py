@@ -492,7 +492,7 @@ def test_yd1000_terminals_without_a_run_function_do_not_block_a_reset(closed: In
 
 
 def test_yd1000_limit_that_the_document_does_not_state_names_its_source() -> None:
-    """The notes limit UL to at most FH, but not FH to at least UL. The library infers the second limit."""
+    """By the notes, the upper frequency limit is at most the maximum frequency. The reverse is inferred."""
     wire = Wire(YD1000(1), {**STANDING, "upper_limit_frequency": 60.0})
     with pytest.raises(
         WriteForbidden, match=r"50\.00 Hz is below upper_limit_frequency, which is 60 Hz"

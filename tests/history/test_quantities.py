@@ -75,7 +75,7 @@ def of(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("points", [300, 30])
-def test_buckets_of_a_register_have_only_its_newest_unit(tmp_path: Path, how: str, points: int) -> None:
+def test_summaries_leave_out_values_in_earlier_units(tmp_path: Path, how: str, points: int) -> None:
     recorded(tmp_path, AMPERE, PERCENT, AMPERE, PERCENT)
     kept(tmp_path, how, 4)
     found, other = of(tmp_path, points)

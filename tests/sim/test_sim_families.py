@@ -1,6 +1,6 @@
 """The simulated drive of every family replies to whole frames as its document says.
 
-A frame whose checksum is written out is printed in the family's document. A frame marked "built" is composed
+A frame whose checksum is written out is printed in the family's document. A frame marked "composed" is made
 from the document's tables. checksums.py computes the checksums of all other frames.
 """
 
@@ -143,7 +143,7 @@ def test_simulated_erman_ramps_the_motor_at_start_and_stop(erman: Bench) -> None
     erman.wait(60)
     assert erman.read(4, 0x400, 2) == [0, 1]
     assert erman.read(4, 0x01) == [285]
-    erman.exchange("01 05 00 01 FF 00 DD FA")  # stop (built)
+    erman.exchange("01 05 00 01 FF 00 DD FA")  # stop; composed from the tables
     erman.wait(0.1)
     assert erman.read(4, 0x400, 2) == [0, 3]
     erman.wait(60)
@@ -163,13 +163,13 @@ def test_simulated_erman_ignores_a_start_while_the_stop_coil_is_on(erman: Bench)
 
 def test_simulated_erman_emergency_stop_prevents_a_start_until_a_reset(erman: Bench) -> None:
     erman.exchange("01 05 00 00 FF 00 8C 3A")
-    erman.exchange("01 05 00 02 FF 00 2D FA")  # emergency stop; the frame is built from the tables
+    erman.exchange("01 05 00 02 FF 00 2D FA")  # emergency stop; composed from the tables
     assert not erman.motor.energised
     assert erman.read(4, 0x402, 2) == [0, 1]
     erman.send(checksums.rtu("01 05 00 02 00 00"))
     erman.exchange("01 05 00 00 FF 00 8C 3A")
     assert not erman.motor.energised
-    erman.exchange("01 05 00 09 FF 00 5C 38")  # reset (built)
+    erman.exchange("01 05 00 09 FF 00 5C 38")  # reset; composed from the tables
     assert not erman.motor.energised
     assert erman.read(4, 0x402, 2) == [0, 1]
     erman.exchange("01 05 00 00 FF 00 8C 3A")
@@ -381,14 +381,14 @@ def test_simulated_innovert_ibd_carries_out_a_broadcast_without_a_reply(ibd: Ben
     ibd.exchange("01 06 20 01 13 88 DE 9C")
     ibd.exchange("01 06 20 00 00 02 03 CB")
     ibd.wait(60)
-    assert ibd.exchange("00 06 20 00 00 01 42 1B") == ""  # stop (built)
+    assert ibd.exchange("00 06 20 00 00 01 42 1B") == ""  # stop; composed from the tables
     ibd.wait(60)
     assert not ibd.motor.energised
 
 
 def test_delixis_forward_command_resets_a_fault_of_a_simulated_innovert_ibd(ibd: Bench) -> None:
     ibd.sim.trip(1)
-    ibd.exchange("01 06 20 00 00 10 83 C6")  # built
+    ibd.exchange("01 06 20 00 00 10 83 C6")  # composed from the tables
     assert (ibd.motor.fault, ibd.motor.energised) == (0, False)
 
 
@@ -427,7 +427,7 @@ def test_simulated_delixi_obeys_the_line_only_if_its_parameters_select_it(delixi
 
 def test_simulated_delixi_reverse_command_turns_the_motor_in_reverse(delixi: Bench) -> None:
     delixi.exchange("01 06 00 02 13 88 25 5C")
-    delixi.exchange("01 06 20 00 00 22 02 13")  # built
+    delixi.exchange("01 06 20 00 00 22 02 13")  # composed from the tables
     delixi.wait(60)
     assert delixi.motor.frequency == -50
 
@@ -452,13 +452,13 @@ def native() -> Bench:
 
 
 def test_simulated_delixi_native_frequency_and_run_state_are_read(native: Bench) -> None:
-    assert native.exchange(":010300000000000004")[:9] == ":01030001"  # built; stopped
+    assert native.exchange(":010300000000000004")[:9] == ":01030001"  # composed from the tables; stopped
     native.exchange(":0104000100001388A1")
     native.exchange(":010200020000000005")
     native.wait(60)
     assert native.exchange(":010701F400000000FD") == ":010701F40000138898"
     assert native.exchange(":010300000000000004")[:9] == ":01030002"
-    native.exchange(":010200030000000006")  # reverse (built)
+    native.exchange(":010200030000000006")  # reverse; composed from the tables
     native.wait(60)
     assert native.exchange(":010300000000000004")[:9] == ":01030003"
 
@@ -546,7 +546,7 @@ def test_simulated_delixi_native_carries_out_a_broadcast_without_a_reply(native:
     native.exchange(":0104000100001388A1")
     native.exchange(":010200020000000005")
     native.wait(60)
-    assert native.exchange(":000200010000000003") == ""  # stop (built)
+    assert native.exchange(":000200010000000003") == ""  # stop; composed from the tables
     native.wait(60)
     assert not native.motor.energised
 
@@ -758,7 +758,7 @@ def test_simulated_yd1000_watchdog_trips_if_the_line_is_silent_too_long(yd: Benc
     assert yd.motor.fault
 
 
-CONFIRMED = {  # Frames to which the reply is a copy. Those of InvtCHE and YD1000 are built from the tables.
+CONFIRMED = {  # Frames to which the reply is a copy. Those of InvtCHE and YD1000 are composed.
     "erman": (
         lambda: ErmanERG220(1),
         "01 05 00 00 FF 00 8C 3A",  # start
