@@ -6,12 +6,14 @@ import asyncio
 import json
 import os
 import signal
+import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import pytest
@@ -26,11 +28,13 @@ from peers import require_module
 
 from multidrop import Batch, InvtCHE, Plant
 from multidrop.control import CommandOutcome, CommandResult
-from multidrop.gateway.commands import Admit
+from multidrop.gateway import commands as commands_module
+from multidrop.gateway.commands import MOST_STOPS, Admit, JoinedStops
 from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.http.rights import Caller, Right
 from multidrop.gateway.mqtt import broker_commands
 from multidrop.gateway.mqtt.broker import (
+    MOST_RECEIVED,
     MOST_UNDER_WAY,
     MOST_WAITING,
     Broker,
@@ -186,6 +190,33 @@ def test_a_burst_of_acknowledgements_wakes_the_event_loop_once(monkeypatch: pyte
     broker._client.on_publish(broker._client, None, 20, 0, None)
     loop.step()
     assert told[20:] == [20]
+
+
+def test_few_received_messages_wait_for_the_event_loop(monkeypatch: pytest.MonkeyPatch) -> None:
+    require_module("paho.mqtt.client")
+    broker, loop, handled = (
+        Broker(parse_broker("mqtt://localhost"), Login(), "a", Silent()),
+        Loop(),
+        list[int](),
+    )
+    monkeypatch.setattr(broker, "loop", loop)
+    monkeypatch.setattr(
+        broker._speaker, "received", lambda topic, payload, **more: handled.append(payload[0])
+    )
+
+    def receive() -> None:
+        for number in range(20):
+            message = SimpleNamespace(topic="stop", payload=bytes([number]), retain=False)
+            broker._client.on_message(broker._client, None, message)
+
+    thread = threading.Thread(target=receive, daemon=True)
+    thread.start()
+    while len(handled) < 20:
+        due = min(MOST_RECEIVED, 20 - len(handled))
+        until(lambda wanted=due: len(loop.calls) == wanted)
+        loop.step()
+    thread.join()
+    assert handled == [*range(20)]
 
 
 OUT_S = float(os.environ.get("BROKER_OUT_S", "1.5"))
@@ -373,6 +404,28 @@ async def test_a_command_is_not_sent_after_its_age_limit(monkeypatch: pytest.Mon
     commands.go_on.set()
     await asyncio.gather(*asyncio.all_tasks() - {asyncio.current_task()})
     assert commands.deadlines == [102 * 10**9]
+
+
+async def test_a_flood_of_stops_is_joined_and_followed_by_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(commands_module, "JOIN_S", 0.0)
+    stops, begun, silent = JoinedStops(), list[int](), asyncio.Event()
+
+    async def stop(number: int) -> None:
+        begun.append(number)
+        await silent.wait()
+
+    def begin(number: int) -> asyncio.Future[None] | None:
+        return stops.begin(None, lambda: asyncio.ensure_future(stop(number)))
+
+    joined = [begin(number) is None for number in range(MOST_STOPS + 3)]
+    assert joined == [False] * MOST_STOPS + [True] * 3
+    assert stops.begin("pump-1", lambda: asyncio.ensure_future(stop(-1))) is not None
+    while MOST_STOPS not in begun:
+        await asyncio.sleep(0)
+    assert begun == [*range(MOST_STOPS), -1, MOST_STOPS]
+    silent.set()
+    await asyncio.gather(*asyncio.all_tasks() - {asyncio.current_task()})
+    assert begin(99) is not None
 
 
 # ---- MQTT through the listener of nats-server: retained state, the last will, commands, and Sparkplug ----

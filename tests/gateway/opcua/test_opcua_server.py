@@ -26,6 +26,7 @@ from lines import PATIENCE, until
 from multidrop import Plant, PlantError, PolledDrive
 from multidrop.families import MODELS
 from multidrop.families.registry import SHIPPED, find_model
+from multidrop.gateway.commands import MOST_STOPS
 from multidrop.gateway.http.rights import Right
 from multidrop.gateway.live import hub
 from multidrop.gateway.opcua.part import SWITCH_S, USUAL_SWITCH_S, OpcUa, OpcUaSettings
@@ -249,7 +250,7 @@ def test_a_stop_method_of_another_drive_is_sent_but_not_confirmed(
     assert not gateway.stands("pump-2")
     assert "stop" in stop(client, "")
     # With the limit 0, the server answers as if the limit of concurrent stops were reached.
-    monkeypatch.setattr("multidrop.gateway.opcua.part.MOST_STOPS", 0)
+    monkeypatch.setattr("multidrop.gateway.commands.MOST_STOPS", 0)
     with pytest.raises(ua.UaStatusCodeError, match="BadMethodInvalid"):
         other.call_method(stop_1)
     assert stop(client, "pump-1") == "the stop is in progress"
@@ -272,6 +273,35 @@ def test_stops_in_one_opc_ua_request_do_not_wait_for_each_other(gateway: Served,
     finally:
         gateway.sims["pump-2"].deaf_until = 0.0
     until(lambda: not gateway.gateway.bus("hall").stops_under_way())
+
+
+YARD = """
+[[line]]
+name = "yard"
+port = "{port}"
+[[line.drive]]
+name = "fan-1"
+model = "invt-che"
+address = 1
+"""
+
+
+@pytest.mark.slow
+def test_a_stop_of_all_drives_is_sent_although_many_wait_for_a_silent_drive(tmp_path: Path) -> None:
+    silent, port = os.openpty()
+    try:
+        with (
+            served(tmp_path, SERVE.format(stop="anyone") + YARD.format(port=os.ttyname(port))) as gateway,
+            Client(url_of(gateway), timeout=PATIENCE) as client,
+        ):
+            for _ in range(MOST_STOPS):
+                assert stop(client) == "the stop is in progress"
+            gateway.start("pump-1")
+            assert stop(client) == "the stop is in progress"
+            until(lambda: gateway.stands("pump-1"))
+    finally:
+        os.close(silent)
+        os.close(port)
 
 
 @pytest.mark.slow

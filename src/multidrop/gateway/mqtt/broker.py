@@ -19,6 +19,7 @@ from multidrop.supervisor import Hung, supervisor
 MOST_UNDER_WAY = 64
 # limit of messages that wait to be sent, at most one per topic; no plant needs more topics
 MOST_WAITING = 4096
+MOST_RECEIVED = 4  # limit of received messages that wait for the event loop
 PORTS = {"mqtt": 1883, "mqtts": 8883}
 RETRY_S = (1, 30)  # in s: the first and the longest pause before reconnecting
 KEEP_ALIVE_S = 15
@@ -204,6 +205,8 @@ class Broker:
         # numbers of acknowledged messages, appended in paho's thread and handled in the event loop
         self._arrived: deque[int] = deque()
         self._why = ""
+        # one permit for each message that may wait for the event loop
+        self._handled = threading.Semaphore(MOST_RECEIVED)
 
     def open(self) -> None:
         """Start to connect. paho retries after each failure."""
@@ -356,6 +359,10 @@ class Broker:
         received = self._speaker.received
 
         def take() -> None:
+            self._handled.release()
             received(message.topic, bytes(message.payload), is_retained=bool(message.retain))
 
+        # the broker waits meanwhile, so a flood of messages delays no stop over another interface
+        while self.loop is not None and not self._handled.acquire(timeout=0.1):
+            pass
         self._call(take)

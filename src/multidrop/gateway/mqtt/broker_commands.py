@@ -7,6 +7,7 @@ the latest reload of the plant file. A verb that stops the motor is always carri
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from collections import deque
 from collections.abc import Callable, Coroutine, Mapping, Sequence
@@ -14,7 +15,7 @@ from typing import Any
 
 from multidrop.control import CommandOutcome, CommandResult
 from multidrop.gateway.clock import boottime_ns
-from multidrop.gateway.commands import MOST_AGE_S, Commands
+from multidrop.gateway.commands import MOST_AGE_S, Commands, JoinedStops
 from multidrop.gateway.http.rights import Caller
 from multidrop.supervisor import supervisor
 
@@ -42,15 +43,23 @@ class BrokerCommands:
         self._report = report
         self._came: deque[object] = deque(maxlen=REMEMBERED)
         self._under_way = 0
+        self._stops = JoinedStops()
 
     def stop(self, drives: Sequence[str] | None, given_id: object = None) -> None:
         """Stop these drives, or all drives if None."""
-        self._begin(self._stop(drives, self._caller.stopping(given_id)))
+        caller = self._caller.stopping(given_id)
+        self._stops.begin(("stop", drives and tuple(drives)), lambda: self._begin(self._stop(drives, caller)))
 
     def stop_by(self, drive: str, verb: str, options: Mapping[str, object], given_id: object = None) -> None:
         """Carry out a verb that stops the motor, however old the command is."""
         caller = self._caller.stopping(given_id)
-        self._begin(self._do(drive, verb, caller, self._commands.act(drive, verb, options, caller)))
+
+        def start() -> asyncio.Task[None]:
+            return self._begin(
+                self._do(drive, verb, caller, self._commands.act(drive, verb, options, caller))
+            )
+
+        self._stops.begin((verb, drive), start)
 
     def write(self, drive: str, register: str, value: float, time_ms: int, given_id: object = None) -> None:
         """Write a register, or report why the command is refused, for example because it is too old.
@@ -136,5 +145,5 @@ class BrokerCommands:
         finally:
             self._under_way -= 1
 
-    def _begin(self, work: Coroutine[Any, Any, None]) -> None:
-        supervisor().start("broker command", work)
+    def _begin(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        return supervisor().start("broker command", work)

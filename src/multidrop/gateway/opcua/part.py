@@ -11,18 +11,18 @@ import gc
 import logging
 import sys
 import time
-from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from importlib import import_module
 from math import inf
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from multidrop import NoReply, Plant
 from multidrop.control import CommandResult
-from multidrop.gateway.commands import MOST_STOPS, drives_of
+from multidrop.gateway.commands import JoinedStops, drives_of
 from multidrop.gateway.http.connections import listen
 from multidrop.gateway.http.rights import Caller, Right, Tokens, caller_with, is_loopback
 from multidrop.gateway.opcua import FAULT, MEMBERS, STATE
@@ -126,8 +126,7 @@ class OpcUa:
         self._seen: dict[str, dict[str, Any]] = {}
         # wrong tokens that were logged, so that each is logged once; used only in the server's thread
         self._wrong = Tokens()
-        # number of stops in progress, by drive; None: stops of all drives
-        self._stopping: Counter[str | None] = Counter()
+        self._stops = JoinedStops()  # used only in the server's thread
         self._loop: asyncio.AbstractEventLoop | None = None
         self._serving: asyncio.Future[None] | None = None  # done when the server's thread has ended
         self._opened: tuple[asyncio.AbstractEventLoop, asyncio.Event, PlantNodes] | None = None
@@ -293,20 +292,13 @@ class OpcUa:
         from multidrop.gateway.opcua.nodes import object_of
 
         assert self._opened is not None
-        assert self._loop is not None
         stops = self._opened[2].stops
         if call.MethodId not in stops:
             return ua.CallMethodResult(ua.StatusCode(ua.StatusCodes.BadMethodInvalid))
         drive, caller = stops[call.MethodId], self._caller(visitor, Right.STOP)
         if caller is None:
             return ua.CallMethodResult(ua.StatusCode(ua.StatusCodes.BadUserAccessDenied))
-        stopping = None
-        if self._stopping[drive] < MOST_STOPS:
-            stopping = asyncio.wrap_future(
-                asyncio.run_coroutine_threadsafe(self._stop(drive, caller), self._loop)
-            )
-            self._stopping[drive] += 1
-            stopping.add_done_callback(lambda _: self._stopping.subtract([drive]))
+        stopping = self._stops.begin(drive, partial(self._begin_stop, drive, caller))
         if call.ObjectId != object_of(drive):
             return _answer(ua.StatusCodes.BadMethodInvalid, "this method belongs to another object")
         if stopping is not None:
@@ -320,6 +312,11 @@ class OpcUa:
         return _answer(
             ua.StatusCodes.BadNoCommunication if is_silent else ua.StatusCodes.BadUnexpectedError, result.text
         )
+
+    def _begin_stop(self, drive: str | None, caller: Caller) -> asyncio.Future[CommandResult]:
+        assert self._loop is not None
+        work = self._stop(drive, caller)
+        return asyncio.wrap_future(asyncio.run_coroutine_threadsafe(work, self._loop))
 
 
 def _answer(code: int, text: str) -> Any:
