@@ -203,7 +203,11 @@ class Poll:
             time.sleep(0.3)
             return wanted <= {row["drive"].partition("-")[0] for row in rows if row["status"] == status}
 
-        plug.wait_until(is_there, patience)
+        try:
+            plug.wait_until(is_there, patience)
+        except AssertionError as failure:
+            failure.add_note(f"since row {after}: {statuses(self.rows()[after:])}\n{self.command.said}")
+            raise
         return len(self.rows())
 
     def end(self) -> dict[str, Any]:
