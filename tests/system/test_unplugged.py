@@ -76,12 +76,13 @@ def test_a_reply_with_an_error_flag_is_a_bad_reply(guest: Guest, format: str, ki
 
 
 def test_a_poll_counts_every_damaged_reply(guest: Guest) -> None:
-    """Each of ten requests reads two registers. On a busy computer a damaged reply may come too late."""
+    """Ten requests read two registers each. After a late reply, some damaged replies belong to no row."""
     found = guest.run("damaged_poll", kind="framing", count=10)
     assert found["wrong"] == []
     damaged = found["counts"]["bad checksum"]
     assert 0 < damaged <= 20
-    assert damaged + found["counts"].get("no reply", 0) >= 20
+    late = found["counts"].get("no reply", 0) + found["counts"].get("not asked: late reply due", 0)
+    assert damaged + late >= 20
     assert sum(map(int, re.findall(r"bad checksum (\d+)", found["output"]))) == damaged
 
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import plug
-from common import FAMILY, Command, Meter, Poll, attempt, insist, run, write_plant
+from common import FAMILY, KINDS, Command, Meter, Poll, attempt, insist, run, write_plant
 
 from multidrop import Bus, ErmanERG220
 from multidrop.cli import main
@@ -35,7 +35,7 @@ def poll_through_unplug(kinds: list[str], names: str) -> dict[str, Any]:
 
     `names` is how the plant names its ports: "path", "by_id" or "by_path".
     """
-    addresses = {kind: [at + 1] for at, kind in enumerate(kinds)}
+    addresses = {kind: [KINDS.index(kind) + 1] for kind in kinds}  # an adapter always finds the same drives
     adapters = {kind: _encoded(kind, f"un-{kind}", addresses[kind]) for kind in kinds}
     before = [adapter.tty for adapter in adapters.values()]
     lines = {kind: (getattr(adapters[kind], names), addresses[kind]) for kind in kinds}
