@@ -415,6 +415,23 @@ def test_a_stop_on_a_closed_port_raises_immediately() -> None:
     assert line.seconds - begun < 0.1
 
 
+def test_stops_of_a_line_do_not_each_wait_for_a_port_that_is_slow_to_open(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A server that is switched off may delay each attempt to connect for five seconds."""
+    line, _, _ = che_drives(20)
+    begun = line.seconds
+
+    def regain() -> None:
+        line.sleep(5)
+        raise PortLost("hall", "timed out")
+
+    line.is_lost, line.fails = True, lambda request: PortLost("hall", "it is closed")
+    monkeypatch.setattr(line, "regain", regain)
+    assert {stopped.seen for stopped in line.bus.stop_all().values()} == {Seen.FAILED}
+    assert line.seconds - begun < LEAST_S + 2 * 5
+
+
 class Careless(Own):
     """A drive whose stop ignores every failure."""
 

@@ -526,8 +526,14 @@ class Stopper:
         line, now = self._exchanges.line, clock.now_ns()
         if not self.is_reopening and line.is_lost and now >= self._regain_ns and line.may_send:
             self._regain_ns = now + REGAIN_NS
-            line.regain()
-            self._regain_ns = 0  # the interval applies only after a failure
+            try:
+                line.regain()
+            except (
+                PortLost
+            ):  # counted from the end of the attempt, because a network may delay it for seconds
+                self._regain_ns = clock.now_ns() + REGAIN_NS
+                raise
+            self._regain_ns = 0
 
 
 def _due(stop: StopAttempt) -> float:
