@@ -140,7 +140,7 @@ def test_the_opc_ua_server_survives_replayed_messages_with_changed_bytes(gateway
         with closing(connected(gateway)) as peer, suppress(OSError):
             peer.sendall(rng.randbytes(rng.randrange(1, 2000)))
     part: Any = gateway.gateway.feeds["opcua"]
-    until(lambda: not part._stopping["pump-1"])
+    until(lambda: not part._stops._running["pump-1"])
     stop_all(f"opc.tcp://127.0.0.1:{port_of(gateway)}/")
     assert gateway.get("/health").json["parts"]["opcua"] == "ok"
 
