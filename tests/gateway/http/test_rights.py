@@ -139,6 +139,11 @@ def test_a_token_is_ignored_if_no_token_file_is_configured(tmp_path: Path) -> No
         assert gateway.post(WRITE[0], {**WRITE[1], "seen": 1}, authorization="Bearer any").status == 401
 
 
+def test_ipv4_clients_of_an_ipv6_socket_count_as_local(tmp_path: Path) -> None:
+    with served(tmp_path, LOOPBACK_STOPS, host="::") as gateway:
+        assert gateway.post(*STOP).json["pump-1"]["done"] is True
+
+
 def test_a_repeated_wrong_token_is_logged_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with served(tmp_path) as gateway:
         for _ in range(3):
