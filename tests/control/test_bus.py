@@ -332,7 +332,7 @@ def test_a_read_is_repeated_after_noise() -> None:
         assert ours.read(ours.speed) == 1480
 
 
-WRONG = {  # wrong replies; pymodbus, libmodbus and minimalmodbus each accept some of them
+WRONG = {  # wrong replies; pymodbus, libmodbus and minimalmodbus each accept some
     "another address": checksums.rtu("02 03 02 00 07"),
     "another function": checksums.rtu("01 04 02 00 07"),
     "too many registers": checksums.rtu("01 03 04 00 07 00 07"),

@@ -78,7 +78,7 @@ def test_a_replaced_drive_is_not_started() -> None:
 
 
 def test_a_drive_replaced_while_its_write_is_counted_is_not_written(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A locked ledger delays the write; meanwhile the adapter is unplugged, and another line plugged in."""
+    """A locked ledger delays the write. During the delay, another line is plugged in."""
     line, drive, _ = one(YD1000(1))
 
     def replace(*given: object) -> str:
@@ -180,7 +180,7 @@ def _on_another_bus(bus: Bus, drive: Any, received: Any, monkeypatch: pytest.Mon
 
 
 def _silent_then_idle(bus: Bus, drive: Any, received: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    be_silent(bus, drive, received)  # so that the start begins with an identity check
+    be_silent(bus, drive, received)  # so that an identity check precedes the start
     bus.peer(drive).c.answered_ns -= 2 * PAUSE_NS
 
 

@@ -118,7 +118,7 @@ def ramped(family: type[Drive], **options: float) -> tuple[Any, Any, Any]:
 
 
 def test_a_ramp_starts_from_the_setpoint_that_it_reads() -> None:
-    """The ramp also works if `set_frequency` writes nothing because the setpoint is already reached."""
+    """The ramp also works if `set_frequency` sends no write, because the drive has the setpoint already."""
     line, drive, _ = ramped(Ramped)
     ramp(drive, 2.0, rate=1.0, every=1.0)
     assert steps(line) == [100, 200]
@@ -266,7 +266,7 @@ class NotedStop:
             act(self._seconds)
 
     def interrupted(self, interruption: BaseException) -> None:
-        """Do nothing: there is nothing to send."""
+        pass
 
     def result(self) -> None:
         """Return None: the motor has stopped."""

@@ -415,7 +415,7 @@ def test_a_write_through_a_ram_alias_is_not_counted_as_an_eeprom_write(tmp_path:
 
 def test_the_drives_watchdog_setting_is_read_if_it_is_readable() -> None:
     line, drive, sim = one(YD1000(1))
-    assert not line.frames  # attaching sends nothing
+    assert not line.frames  # attaching sends no request
     assert line.bus.watchdog(drive) == (
         "its watchdog (communication_timeout) is off: the motor runs on when the client dies"
     )

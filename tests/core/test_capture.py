@@ -34,7 +34,7 @@ from multidrop.core import (
 
 Pair = tuple[Printed, Printed]
 REPLIES = [each for each in PRINTED if each.request is not None and isinstance(each.says, Message)]
-WRITE = bytes.fromhex("01 06 20 01 13 88 DE 9C")  # a write; its reply is a copy of it
+WRITE = bytes.fromhex("01 06 20 01 13 88 DE 9C")  # a write, whose reply is equal
 READ, ANSWER = bytes.fromhex("01 03 00 16 00 01 65 CE"), bytes.fromhex("01 03 02 18 00 B2 44")
 OTHER_READ = bytes.fromhex("01 03 01 F4 00 01 C4 04")
 ALSO_ANSWER = bytes.fromhex("01 03 02 13 88 B5 12")  # another reply with the length of ANSWER

@@ -88,7 +88,7 @@ def test_closing_a_history_writer_writes_all_rows(tmp_path: Path, writers: Write
 
 
 def test_batches_of_two_pollers_are_recorded(tmp_path: Path, writers: Writers) -> None:
-    """In the batches of the two pollers, the same code stands for different names."""
+    """In the batches of the two pollers, equal codes mean different names."""
     writer = writers(tmp_path)
     taken = [
         batch(Names([name]), 0, range(20), NOON, SECOND) for name in ("pump-1", "fan", "pump-1", "mixer")

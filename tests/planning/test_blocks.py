@@ -282,7 +282,7 @@ def test_no_other_plan_for_a_built_in_family_takes_less_time(data: st.DataObject
             tables.setdefault(register.table, []).append(register)
     registers = data.draw(st.sampled_from([*tables.values()]))
     first = data.draw(st.integers(0, len(registers) - 1))
-    near = registers[first : first + 12]  # neighbouring registers, of which some can share a request
+    near = registers[first : first + 12]  # neighbouring registers; some can share a request
     wanted = data.draw(st.lists(st.sampled_from(near), unique=True, min_size=1, max_size=8))
     drive = family(
         1,

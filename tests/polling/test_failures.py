@@ -335,7 +335,7 @@ async def give_later(batch: object) -> Any:
 
 class Waiting:
     async def __call__(self, batch: object) -> None:
-        """Do nothing, like `wait`."""
+        pass
 
 
 @pytest.mark.parametrize(

@@ -420,7 +420,7 @@ class Busy:
     bus = SimpleNamespace(leave=lambda: None, part=lambda: None)
 
     def leave(self) -> None:
-        """Do nothing."""
+        pass
 
     def end(self) -> bool:
         return True

@@ -138,7 +138,7 @@ def test_fault_start_noise_occurs_only_when_a_motor_starts() -> None:
 
 
 def two_drives(**faults: Any) -> LineClient:
-    """Return the client of a line with two drives, of which the second has these faults."""
+    """Return the client of a line with two drives; the second drive has these faults."""
     drives = [SimulatedDrive(Toy(1, name="sound")), SimulatedDrive(Toy(2, name="flaky"))]
     return LineClient(*drives, drives={"flaky": DriveFaults(**faults)})
 

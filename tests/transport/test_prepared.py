@@ -387,7 +387,7 @@ def test_a_dead_drive_gets_only_one_additional_shorter_request() -> None:
 
 @pytest.mark.parametrize("silent", [{1}, {1, 2}, {0, 2}])
 def test_a_foreign_reply_to_only_one_attempt_is_reported(silent: set[int]) -> None:
-    """The attempts in `silent` receive nothing. The other attempts receive a reply from another address."""
+    """The attempts in `silent` get no reply. The other attempts get a reply from another address."""
     drive = family(2)(1, name="pump-1")
     bus = SimulatedBus(Picky(drive))
     bus.attach(drive)
