@@ -120,7 +120,7 @@ def _value_families(hub: Hub) -> Iterator[MetricFamily]:
     """Yield a metric family of polled values for each unit, then one with the age of each value."""
     values: dict[str, list[Sample]] = {}
     ages: list[Sample] = []
-    now_ns = hub.now_ns()
+    now_ns, woke_ns, utc_ns = hub.now_ns(), hub.woke_ns(), time.time_ns()
     for line in hub.plant.lines:
         for polled in line.drives:
             name = polled.drive.name
@@ -128,7 +128,10 @@ def _value_families(hub: Hub) -> Iterator[MetricFamily]:
                 if good is None:
                     continue
                 labels = {"line": line.name, "drive": name, "register": register.name}
-                ages.append(("", labels, (now_ns - good[1]) / 1e9))
+                age_ns = now_ns - good[1]
+                if good[1] < woke_ns:  # the monotonic clock stopped while the computer slept
+                    age_ns = max(age_ns, utc_ns - good[0])
+                ages.append(("", labels, age_ns / 1e9))
                 if is_current:
                     unit = base_unit(register)
                     labels = labels | {"unit": register.value_unit} if unit is OTHER else labels

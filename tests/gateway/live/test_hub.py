@@ -525,3 +525,15 @@ def test_values_stay_current_for_the_cycle_of_the_reloaded_line(clock: HubClock)
         assert hub.holds_s("pump-1", "output_frequency") == Hub(one).holds_s("pump-1", "output_frequency")
     assert Hub(alone).holds_s("pump-1", "output_frequency") == 1.0
     assert (Hub(crowded).holds_s("pump-1", "output_frequency") or 0.0) > 2.0
+
+
+def test_ages_in_prometheus_metrics_include_sleep(
+    hub: Hub, clock: HubClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hub.take(rows((10, FREQUENCY, 25)))
+    clock.now_ns, clock.slept_ns = 20 * PERIOD, 8 * 3600 * SECOND
+    now_ns = UTC_0 + clock.now_ns + clock.slept_ns
+    monkeypatch.setattr("multidrop.gateway.metrics.time.time_ns", lambda: now_ns)
+    families = {family.name: family.samples for family in plant_families(hub, {})}
+    [(_, labels, age_s)] = families["multidrop_register_age_seconds"]
+    assert (labels["register"], age_s) == ("output_frequency", 8 * 3600 + 1.0)
