@@ -442,7 +442,9 @@ def test_a_wrong_identity_is_logged_once(caplog: pytest.LogCaptureFixture) -> No
     bus = AskedBus(failures)
     with caplog.at_level(logging.WARNING):
         assert ask_all(bus, lambda name: True, *failures, "pump-1") == ["failed", "failed"]
-    assert [one.message for one in caplog.records] == [str(stranger)]
+    # the supervisor may log that a thread ended after this test's event loop
+    told = [one.message for one in caplog.records if one.name == "multidrop.gateway"]
+    assert told == [str(stranger)]
     assert bus.names == [*failures, "pump-1"] * 2
 
 
