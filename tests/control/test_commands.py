@@ -23,8 +23,11 @@ from multidrop.control import commands
 from multidrop.control.commands import (
     AGAIN_S,
     BEGINNING_S,
+    JOIN_S,
+    MOST_STOPS,
     REPEATED_S,
     TURN_S,
+    JoinedStops,
     LineStop,
     RepeatedStops,
     Results,
@@ -394,3 +397,27 @@ def test_a_stop_is_not_repeated_if_an_earlier_stop_used_up_its_time() -> None:
     timed = TimedStops(NotedStops(), 0)
     assert run_controlled(timed.called_beside(REPEATED_S + 1)) == SILENT
     assert timed.calls == [0.0]
+
+
+def test_a_flood_of_stops_is_joined_and_followed_by_a_stop() -> None:
+    async def main() -> None:
+        stops, begun, silent = JoinedStops(), list[int](), asyncio.Event()
+
+        async def stop(number: int) -> int:
+            begun.append(number)
+            await silent.wait()
+            return number
+
+        def begin(number: int, drive: str = "pump") -> asyncio.Future[int]:
+            return stops.begin(drive, lambda: asyncio.ensure_future(stop(number)))
+
+        called = [*map(begin, range(MOST_STOPS + 3)), begin(-1, "fan")]
+        await asyncio.sleep(JOIN_S / 2)
+        assert begun == [*range(MOST_STOPS), -1]
+        await asyncio.sleep(JOIN_S)
+        assert begun == [*range(MOST_STOPS), -1, MOST_STOPS]
+        silent.set()
+        assert await asyncio.gather(*called) == [*range(MOST_STOPS), *[MOST_STOPS] * 3, -1]
+        assert not stops._running
+
+    run_controlled(main())

@@ -8,7 +8,7 @@ returns a CommandResult.
 from __future__ import annotations
 
 import asyncio
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from math import isfinite
@@ -36,6 +36,8 @@ AGAIN_S = 0.2  # s; pause between two stops in the event loop, so that its other
 STOP_S = 30.0  # s; how long the event loop repeats stops, if no thread can be started
 # s; a drive's stop is repeated for at least this long after a client's newest call of a stop
 REPEATED_S = 30.0
+MOST_STOPS = 8  # limit of concurrent stops of one drive that arrive over one interface
+JOIN_S = 0.5  # s; stops above that limit are joined for this long, and then sent as one stop
 BEGINNING_S = 0.25  # s; longest time from the call of a stop until `stops_under_way` lists it
 
 R = TypeVar("R")
@@ -319,3 +321,42 @@ class RepeatedStops:
 
 def _now() -> float:
     return asyncio.get_running_loop().time()
+
+
+class JoinedStops:
+    """Starts the stops that arrive over one interface, so that a flood of stops delays no other stop.
+
+    While MOST_STOPS stops of the same drives are in progress, further ones are joined: JOIN_S later, one stop
+    is started for all of them.
+    """
+
+    def __init__(self) -> None:
+        self._running: Counter[object] = Counter()  # number of stops in progress by their drives
+        self._joined: dict[object, asyncio.Future[Any]] = {}  # stops that are started after JOIN_S
+
+    def begin(self, drives: object, start: Callable[[], asyncio.Future[R]]) -> asyncio.Future[R]:
+        """Start a stop, and return its future; several joined stops have the same future.
+
+        `drives` says which drives it stops, and `start` starts it.
+        """
+        if self._running[drives] < MOST_STOPS:
+            return self._start(drives, start)
+        if drives not in self._joined:
+            self._joined[drives] = supervisor().start("joined stops", self._start_joined(drives, start))
+        return self._joined[drives]
+
+    async def _start_joined(self, drives: object, start: Callable[[], asyncio.Future[R]]) -> R:
+        await asyncio.sleep(JOIN_S)
+        del self._joined[drives]
+        return await self._start(drives, start)
+
+    def _start(self, drives: object, start: Callable[[], asyncio.Future[R]]) -> asyncio.Future[R]:
+        stopping = start()
+        self._running[drives] += 1
+        stopping.add_done_callback(lambda _: self._end(drives))
+        return stopping
+
+    def _end(self, drives: object) -> None:
+        self._running[drives] -= 1
+        if not self._running[drives]:
+            del self._running[drives]

@@ -36,8 +36,6 @@ from multidrop.supervisor import supervisor
 MOST_AGE_S = 5.0  # age limit, in s, of writes and verbs when they arrive; stops have none
 LOOK_S = 0.02  # pause between two checks for drives that a reload has changed during their stop
 MOST_WRITES = 8  # limit of concurrent writes on one line; stops are not counted
-MOST_STOPS = 8  # limit of concurrent stops of one drive that arrive over one interface
-JOIN_S = 0.5  # in s: stops above that limit are joined for this long, and then sent as one stop
 # Values of the field `rule` of WriteForbidden.
 BUSY = "too many writes are under way"
 STOOD_STILL = "the gateway stood still"
@@ -49,8 +47,6 @@ WAYS_WITHOUT_VERBS = frozenset({"modbus", "tool"})
 # A function that takes a command's text and returns the deadline for sending the command (CLOCK_BOOTTIME,
 # ns). It raises WriteForbidden if the command must not be sent.
 Admit = Callable[[str], float]
-
-StopFuture = asyncio.Future[Any]
 
 _CALL = re.compile(r"(?P<how>call |run `multidrop )?\b(?P<verb>[a-z_-]+)(?P<end>\(\)|`)?")
 _log = logging.getLogger("multidrop.gateway")
@@ -396,45 +392,6 @@ async def stop_meant(
     if failed and plant.lines != before:
         results |= await stop(plant, failed)
     return results if drives is None else {name: results[one] for name, one in meant.items()}
-
-
-class JoinedStops:
-    """Starts the stops that arrive over one interface, so that a flood of stops delays no other stop.
-
-    While MOST_STOPS stops of the same drives are in progress, further ones are joined: JOIN_S later, one stop
-    is started for all of them.
-    """
-
-    def __init__(self) -> None:
-        self._running: Counter[object] = Counter()  # number of stops in progress by their drives
-        self._due: set[object] = set()  # drives for which a joined stop will be started
-
-    def begin(self, drives: object, start: Callable[[], StopFuture]) -> StopFuture | None:
-        """Start a stop, and return its future; return None if the stop is joined with others.
-
-        `drives` says which drives it stops, and `start` starts it.
-        """
-        if self._running[drives] < MOST_STOPS:
-            return self._start(drives, start)
-        if drives not in self._due:
-            self._due.add(drives)
-            asyncio.get_running_loop().call_later(JOIN_S, self._start_joined, drives, start)
-        return None
-
-    def _start_joined(self, drives: object, start: Callable[[], StopFuture]) -> None:
-        self._due.discard(drives)
-        self._start(drives, start)
-
-    def _start(self, drives: object, start: Callable[[], StopFuture]) -> StopFuture:
-        stopping = start()
-        self._running[drives] += 1
-        stopping.add_done_callback(lambda _: self._end(drives))
-        return stopping
-
-    def _end(self, drives: object) -> None:
-        self._running[drives] -= 1
-        if not self._running[drives]:
-            del self._running[drives]
 
 
 # ---- results ----

@@ -25,12 +25,26 @@ from tables import table
 
 from multidrop import InvtCHE, Stopped
 from multidrop.control import CommandOutcome, Seen, read_audit, records
-from multidrop.control.commands import RepeatedStops, Results, begin_stops, stop_drive, stop_line
+from multidrop.control.commands import (
+    MOST_STOPS,
+    RepeatedStops,
+    Results,
+    begin_stops,
+    stop_drive,
+    stop_line,
+)
 from multidrop.fleet.commands import desk as desk_module
 from multidrop.fleet.commands import log as log_module
 from multidrop.fleet.commands.desk import MOST_WRITES
 from multidrop.fleet.commands.log import CommandLog
-from multidrop.fleet.commands.messages import CommandAnswer, CommandRequest, Offered, read_answer, read_offer
+from multidrop.fleet.commands.messages import (
+    CommandAnswer,
+    CommandRequest,
+    Offered,
+    StopRequest,
+    read_answer,
+    read_offer,
+)
 from multidrop.fleet.commands.offers import prepare
 
 DONE, REFUSED, NOT_SENT, UNKNOWN = (
@@ -490,6 +504,28 @@ def test_an_offer_does_not_change_the_known_setpoint() -> None:
     drive.commanded = 40.0
     prepare(drive, CommandRequest("1", "anna", "mill", verb="set_frequency", options={"hz": 10.0}))
     assert drive.commanded == 40.0
+
+
+async def test_a_joined_stop_cancels_offered_commands_immediately(
+    desk: Desks, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun, silent = list[str](), asyncio.Event()
+
+    async def stop(held: Any, request: StopRequest) -> CommandAnswer:
+        begun.append(request.id)
+        await silent.wait()
+        return CommandAnswer(DONE, "it stands")
+
+    monkeypatch.setattr(desk.stops, "_stop_or_report", stop)
+    called = [asyncio.create_task(desk.stop()) for _ in range(MOST_STOPS)]
+    await asyncio.sleep(0)
+    token = desk.offered()
+    called += [asyncio.create_task(desk.stop()) for _ in range(5)]
+    await asyncio.sleep(0)
+    assert (await desk.do(token)).outcome is NOT_SENT
+    silent.set()
+    assert {answer.outcome for answer in await asyncio.gather(*called) if answer} == {DONE}
+    assert len(begun) == MOST_STOPS + 1
 
 
 # ---- the log of commands on disks that hang or fail, and after its thread was killed ----

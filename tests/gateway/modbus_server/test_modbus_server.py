@@ -31,11 +31,12 @@ from multidrop import (
     setting,
 )
 from multidrop.control import CommandOutcome, CommandResult, NotAttached
+from multidrop.control.commands import MOST_STOPS
 from multidrop.core import NumberFormat
 from multidrop.drive import COIL, Kept
 from multidrop.errors import PortLost
 from multidrop.families import DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
-from multidrop.gateway.commands import BUSY, MOST_STOPS
+from multidrop.gateway.commands import BUSY
 from multidrop.gateway.http.rights import NOT_ALLOWED, NOT_LISTED, Caller, Right
 from multidrop.gateway.modbus_server.protocol import PassingBusy
 from multidrop.gateway.modbus_server.settings import ModbusSettings

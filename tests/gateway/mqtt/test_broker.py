@@ -28,8 +28,7 @@ from peers import require_module
 
 from multidrop import Batch, InvtCHE, Plant
 from multidrop.control import CommandOutcome, CommandResult
-from multidrop.gateway import commands as commands_module
-from multidrop.gateway.commands import MOST_STOPS, Admit, JoinedStops
+from multidrop.gateway.commands import Admit
 from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.http.rights import Caller, Right
 from multidrop.gateway.mqtt import broker_commands
@@ -404,28 +403,6 @@ async def test_a_command_is_not_sent_after_its_age_limit(monkeypatch: pytest.Mon
     commands.go_on.set()
     await asyncio.gather(*asyncio.all_tasks() - {asyncio.current_task()})
     assert commands.deadlines == [102 * 10**9]
-
-
-async def test_a_flood_of_stops_is_joined_and_followed_by_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(commands_module, "JOIN_S", 0.0)
-    stops, begun, silent = JoinedStops(), list[int](), asyncio.Event()
-
-    async def stop(number: int) -> None:
-        begun.append(number)
-        await silent.wait()
-
-    def begin(number: int) -> asyncio.Future[None] | None:
-        return stops.begin(None, lambda: asyncio.ensure_future(stop(number)))
-
-    joined = [begin(number) is None for number in range(MOST_STOPS + 3)]
-    assert joined == [False] * MOST_STOPS + [True] * 3
-    assert stops.begin("pump-1", lambda: asyncio.ensure_future(stop(-1))) is not None
-    while MOST_STOPS not in begun:
-        await asyncio.sleep(0)
-    assert begun == [*range(MOST_STOPS), -1, MOST_STOPS]
-    silent.set()
-    await asyncio.gather(*asyncio.all_tasks() - {asyncio.current_task()})
-    assert begin(99) is not None
 
 
 # ---- MQTT through the listener of nats-server: retained state, the last will, commands, and Sparkplug ----

@@ -24,9 +24,9 @@ from kills import BoundProcess
 from lines import PATIENCE, until
 
 from multidrop import Plant, PlantError, PolledDrive
+from multidrop.control.commands import MOST_STOPS
 from multidrop.families import MODELS
 from multidrop.families.registry import SHIPPED, find_model
-from multidrop.gateway.commands import MOST_STOPS
 from multidrop.gateway.http.rights import Right
 from multidrop.gateway.live import hub
 from multidrop.gateway.opcua.part import SWITCH_S, USUAL_SWITCH_S, OpcUa, OpcUaSettings
@@ -250,7 +250,7 @@ def test_a_stop_method_of_another_drive_is_sent_but_not_confirmed(
     assert not gateway.stands("pump-2")
     assert "stop" in stop(client, "")
     # With the limit 0, the server answers as if the limit of concurrent stops were reached.
-    monkeypatch.setattr("multidrop.gateway.commands.MOST_STOPS", 0)
+    monkeypatch.setattr("multidrop.control.commands.MOST_STOPS", 0)
     with pytest.raises(ua.UaStatusCodeError, match="BadMethodInvalid"):
         other.call_method(stop_1)
     assert stop(client, "pump-1") == "the stop is in progress"

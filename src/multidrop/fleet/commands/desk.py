@@ -31,7 +31,7 @@ from nats.aio.msg import Msg
 
 from multidrop import Unsupported
 from multidrop.control import CommandOutcome, CommandResult, written_by
-from multidrop.control.commands import LineStop, RepeatedStops, begin_command, stop_line
+from multidrop.control.commands import JoinedStops, LineStop, RepeatedStops, begin_command, stop_line
 from multidrop.fleet.commands.held_lines import HeldLine, HeldLines
 from multidrop.fleet.commands.log import CommandLog
 from multidrop.fleet.commands.messages import (
@@ -220,7 +220,8 @@ class StopDesk:
         self._offers = offers
         self._log = log
         # running stops, by the line's `HeldLine.number` and the bytes of the stop's message
-        self._stops: dict[tuple[int, object], asyncio.Task[CommandAnswer]] = {}
+        self._stops: dict[tuple[int, object], asyncio.Future[CommandAnswer]] = {}
+        self._joined = JoinedStops()
         self._repeated = RepeatedStops()
 
     async def stop(self, line: str, data: bytes) -> CommandAnswer | None:
@@ -245,7 +246,11 @@ class StopDesk:
             request = request._replace(drives=tuple(drive_meant(one, held.drives) for one in request.drives))
         key = (held.number, sha256(data).digest() if request.id else object())
         if key not in self._stops:
-            self._stops[key] = supervisor().start("stop", self._stop_or_report(held, request))
+            self._offers.void(held.name, request.drives, CALLED)
+            self._stops[key] = self._joined.begin(
+                (held.number, request.drives),
+                lambda: supervisor().start("stop", self._stop_or_report(held, request)),
+            )
             while len(self._stops) > STOPS_REMEMBERED:
                 del self._stops[next(iter(self._stops))]
         task = self._stops[key]
@@ -279,7 +284,6 @@ class StopDesk:
 
         If an earlier stop of a drive is still being repeated, send one more stop command.
         """
-        self._offers.void(held.name, request.drives, CALLED)
         drives = held.drives
         asked = list(drives) if request.drives is None else list(dict.fromkeys(request.drives))
         stopped = [drives[name] for name in asked if name in drives]

@@ -16,9 +16,10 @@ from math import inf
 from typing import Any, Protocol
 
 from multidrop import Register, WriteForbidden
+from multidrop.control.commands import MOST_STOPS
 from multidrop.drive import Carrier
 from multidrop.gateway.clock import boottime_ns
-from multidrop.gateway.commands import MOST_AGE_S, MOST_STOPS, STOOD_STILL, Commands
+from multidrop.gateway.commands import MOST_AGE_S, STOOD_STILL, Commands
 from multidrop.gateway.http.rights import Caller, Right
 from multidrop.gateway.modbus_server.protocol import (
     WRITES,

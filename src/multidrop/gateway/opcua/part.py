@@ -22,7 +22,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from multidrop import NoReply, Plant
 from multidrop.control import CommandResult
-from multidrop.gateway.commands import JoinedStops, drives_of
+from multidrop.control.commands import JoinedStops
+from multidrop.gateway.commands import drives_of
 from multidrop.gateway.http.connections import listen
 from multidrop.gateway.http.rights import Caller, Right, Tokens, caller_with, is_loopback
 from multidrop.gateway.opcua import FAULT, MEMBERS, STATE
@@ -301,9 +302,8 @@ class OpcUa:
         stopping = self._stops.begin(drive, partial(self._begin_stop, drive, caller))
         if call.ObjectId != object_of(drive):
             return _answer(ua.StatusCodes.BadMethodInvalid, "this method belongs to another object")
-        if stopping is not None:
-            await asyncio.wait([stopping], timeout=STOP_WAIT_S)
-        if stopping is None or not stopping.done():
+        await asyncio.wait([stopping], timeout=STOP_WAIT_S)
+        if not stopping.done():
             return _answer(ua.StatusCodes.GoodCompletesAsynchronously, "the stop is in progress")
         result = stopping.result()
         if result.ok:
