@@ -294,7 +294,7 @@ static int fits(int layout, const struct function *function, const struct md_mes
     case COUNTED:
         return message->data_len >= 1;
     case QUEUE:
-        return message->data_len >= 2 && message->data_len == 2 + md_get16(message->data);
+        return message->data_len == 2 + md_get16(message->data);
     case IDENTITY:
         return message->data_len == 3 && message->data[0] == MEI_IDENTITY;
     case OBJECTS:
@@ -350,8 +350,7 @@ static int confirms(int framing, const uint8_t *body, const struct md_message *r
         return start == request->start && ((request->function == MD_LOOPBACK && start != 0) ||
                                            memcmp(body + 4, request->data, 2) == 0);
     case MASK:
-        return start == request->start && memcmp(body + 4, request->data, 4) == 0;
-    case LONG: /* the value is never 0: such a reply would equal the query */
+    case LONG: /* the value of a state query is never 0: such a reply would equal the query */
         return (request->function == MD_DELIXI_STATE_QUERY ? start != 0 : start == request->start) &&
                (request->function == MD_DELIXI_PARAMETER_QUERY || memcmp(body + 4, request->data, 4) == 0);
     case OBJECTS:

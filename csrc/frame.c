@@ -20,7 +20,7 @@
 #define HALF(n, ...) QUARTER(n, __VA_ARGS__), QUARTER(n + 64, __VA_ARGS__)
 #define ALL(...) {HALF(0, __VA_ARGS__), HALF(128, __VA_ARGS__)}
 
-static const uint16_t crc_of[4][256] = {
+static const uint16_t crc_of[][256] = {
     ALL(0xC0C1, 0xC181, 0xC301, 0xC601, 0xCC01, 0xD801, 0xF001, 0xA001),
     ALL(0x9001, 0x6001, 0xC002, 0xC007, 0xC00D, 0xC019, 0xC031, 0xC061),
     ALL(0xC051, 0xC0A1, 0xC141, 0xC281, 0xC501, 0xCA01, 0xD401, 0xE801),
@@ -134,7 +134,7 @@ static int open_tcp(const uint8_t *bytes, size_t len, const struct md_message *r
     int whole = md_tcp_length(bytes, len);
     if (md_tcp_is_exception(bytes, len, request))
         whole = MD_TCP_EXCEPTION;
-    else if (whole == MD_NO_START && request && len < MD_TCP_HEAD + 2 && (len < 4 || !md_get16(bytes + 2)))
+    else if (whole == MD_NO_START && request && len < MD_TCP_HEAD + 2 && !md_get16(bytes + 2))
         return MD_INCOMPLETE; /* with one more byte it may be an exception whose header has a wrong length */
     if (whole <= 0)
         return whole;
@@ -263,9 +263,17 @@ int md_longest_reply(int framing, const struct md_message *request)
 
 /* ---- why a request has no reply ---- */
 
-/* Rank reasons by how specific they are. The most specific reason is reported; among equally specific ones,
- * the first. The search continues inside a frame from another address: the expected frame may start there. */
-static int weight(int reason)
+/* Return the offset at which the next frame may start: the next byte, or with Modbus TCP the end of this
+ * frame. After a damaged Modbus TCP header the offset is unknown; then return `len`. */
+static size_t next_at(int framing, const uint8_t *bytes, size_t len)
+{
+    int whole = framing == MD_TCP ? md_tcp_length(bytes, len) : 1;
+    return whole > 0 ? (size_t)whole : len;
+}
+
+/* Return the most specific reason; among equally specific ones, the first. The search continues inside a
+ * frame from another address: the expected frame may start there. */
+int md_reason(int framing, const struct md_message *request, const uint8_t *bytes, size_t len)
 {
     static const uint8_t weights[] = {
         [-MD_NO_START] = 1,
@@ -277,30 +285,20 @@ static int weight(int reason)
         [-MD_BAD_CHECKSUM] = 6,
         [-MD_BAD_ECHO] = 7,
     };
-    return reason < 0 && (size_t)-reason < sizeof weights ? weights[-reason] : 0;
-}
-
-/* Return the offset at which the next frame may start: the next byte, or with Modbus TCP the end of this
- * frame. After a damaged Modbus TCP header the offset is unknown; then return `len`. */
-static size_t next_at(int framing, const uint8_t *bytes, size_t len)
-{
-    int whole = framing == MD_TCP ? md_tcp_length(bytes, len) : 1;
-    return whole > 0 ? (size_t)whole : len;
-}
-
-int md_reason(int framing, const struct md_message *request, const uint8_t *bytes, size_t len)
-{
     struct md_message reply;
-    int reason = MD_NO_REPLY;
-    if (len)
-        reason = MD_INCOMPLETE;
+    if (len == 0)
+        return MD_NO_REPLY;
+    int reason = MD_INCOMPLETE;
     for (size_t at = 0; at < len; at += next_at(framing, bytes + at, len - at)) {
         int why = md_parse_reply(framing, bytes + at, len - at, request, &reply);
+        if (why > 0) {
+            if (md_is_from_gateway(framing, &reply))
+                return MD_NO_REPLY;
+            continue;
+        }
         if (why == MD_INCOMPLETE)
             why = MD_CUT_SHORT;
-        if (why > 0 && md_is_from_gateway(framing, &reply))
-            return MD_NO_REPLY;
-        if (weight(why) > weight(reason))
+        if (weights[-why] > weights[-reason])
             reason = why;
     }
     return reason;

@@ -226,8 +226,15 @@ static const struct {
     {"half a value written", MD_RTU, 0, {.address = 1, .function = 6, .data_len = 1}},
     {"two values written by one's function", MD_RTU, 0, {.address = 1, .function = 6, .data_len = 4}},
     {"a mask written", MD_RTU, 10, {.address = 1, .function = 0x16, .start = 4, .data_len = 4}},
-    {"an empty queue", MD_RTU, 6, {.address = 1, .function = 0x18, .data_len = 2}},
+    {"an empty queue", MD_RTU, 8, {.address = 1, .function = 0x18, .data_len = 4, .data = {0, 2}}},
     {"a queue of another length", MD_RTU, 0, {.address = 1, .function = 0x18, .data_len = 4}},
+    {"no bytes of a server id", MD_RTU, 0, {.address = 1, .function = 0x11}},
+    {"one byte of a server id", MD_RTU, 6, {.address = 1, .function = 0x11, .data_len = 1}},
+    {"an identification without objects", MD_RTU, 10, {.address = 1, .function = 0x2B, .data_len = 6,
+                                                            .data = {0x0E, 1, 1}}},
+    {"an identification without its last object", MD_RTU, 0, {.address = 1, .function = 0x2B,
+                                                            .data_len = 250,
+                                                            .data = {0x0E, 1, 1, 0, 0, 2, 0, 242}}},
     {"an answer to what nobody here knows", MD_RTU, 0, {.address = 1, .function = 0x17, .data_len = 2}},
     {"an answer from a reserved address", MD_RTU, 0, {.address = 248, .function = 6, .data_len = 2}},
     {"a value", MD_DELIXI, 21, {.address = 1, .function = 7, .data_len = 4}},
@@ -264,6 +271,7 @@ static const struct {
 } verdicts[] = {
     {"no function", "01 42", MD_RTU, MD_BAD_FUNCTION, {0}},
     {"no function, as text", ":0142", MD_ASCII, MD_BAD_FUNCTION, {0}},
+    {"the code after the last known function", "01 2C", MD_RTU, MD_BAD_FUNCTION, {0}},
     {"an exception's function", "01 83", MD_RTU, MD_BAD_FUNCTION, {0}},
     {"what only the drive may say", ":01F0", MD_DELIXI, MD_BAD_FUNCTION, {0}},
     {"a word more than may be written", "01 10 00 00 00 7C F8", MD_RTU, MD_BAD_LENGTH, {0}},
@@ -288,6 +296,17 @@ static const struct {
     {"a head that is longer than its read", "00 01 00 00 00 07 01 03", MD_TCP, MD_BAD_LENGTH, {0}},
     {"a head that ends before the count", "00 01 00 00 00 02 01 10", MD_TCP, MD_BAD_LENGTH, {0}},
     {"a read over a network", "00 01 00 00 00 06 01 03 00 00 00 01", MD_TCP, 12, {0}},
+    {"a request of another MEI type", "01 2B 0D", MD_RTU, MD_BAD_FUNCTION, {0}},
+    {"a request of a queue", "00 01 00 00 00 04 01 18 04 DE", MD_TCP, 10, {0}},
+    {"a status over a network", "00 01 00 00 00 03 01 07 6D", MD_TCP, 9, {.address = 1, .function = 7}},
+    {"an identification without objects", "00 01 00 00 00 08 01 2B 0E 01 01 00 00 00", MD_TCP, 14,
+     {.address = 1, .function = 0x2B, .data_len = 3, .data = {0x0E, 1}}},
+    {"an answer of another protocol", "00 01 00 01", MD_TCP, MD_NO_START, {.address = 1, .function = 3,
+                                                            .count = 1}},
+    {"an exception with a short head", "00 01 00 00 00 01 01 83 02", MD_TCP, 9, {.address = 1,
+                                                            .function = 3, .count = 1}},
+    {"an exception with a long head", "00 01 00 00 01 03 01 83 02", MD_TCP, 9, {.address = 1,
+                                                            .function = 3, .count = 1}},
     {"another drive", "02", MD_RTU, MD_BAD_ADDRESS, {.address = 1, .function = 3, .count = 2}},
     {"another drive, as text", ":02", MD_DELIXI, MD_BAD_ADDRESS, {.address = 1, .function = 7,
                                                             .data_len = 4}},
@@ -302,9 +321,13 @@ static const struct {
     {"2000 bits begin", "01 01 FA", MD_RTU, MD_INCOMPLETE, {.address = 1, .function = 1, .count = 2000}},
     {"an answer to no function", "01 42", MD_RTU, MD_BAD_FUNCTION, {.address = 1, .function = 0x42}},
     {"an event log", "01 0C 02 00 00 BB 50", MD_RTU, 7, {.address = 1, .function = 0x0C}},
-    {"a queue", "01 18 00 F8", MD_RTU, MD_INCOMPLETE, {.address = 1, .function = 0x18}},
+    {"a queue over a network", "00 01 00 00 00 0A 01 18 00 06 00 02 01 B8 12 84", MD_TCP, 16,
+     {.address = 1, .function = 0x18, .start = 0x04DE}},
+    {"the longest queue", "01 18 00 F8", MD_RTU, MD_INCOMPLETE, {.address = 1, .function = 0x18}},
     {"a queue that is too long", "01 18 00 F9", MD_RTU, MD_BAD_LENGTH, {.address = 1, .function = 0x18}},
     {"no bytes of a server id", "01 11 00", MD_RTU, MD_BAD_LENGTH, {.address = 1, .function = 0x11}},
+    {"a server id of one byte", "01 11 01", MD_RTU, MD_INCOMPLETE, {.address = 1, .function = 0x11}},
+    {"the longest server id", "01 11 FA", MD_RTU, MD_INCOMPLETE, {.address = 1, .function = 0x11}},
     {"too many of them", "01 11 FB", MD_RTU, MD_BAD_LENGTH, {.address = 1, .function = 0x11}},
     {"another MEI type", "01 2B 0D", MD_RTU, MD_BAD_FUNCTION, {.address = 1, .function = 0x2B}},
     {"a long identification", "01 2B 0E 01 01 00 00 01 00 F2", MD_RTU, MD_INCOMPLETE, {.address = 1,
@@ -330,6 +353,52 @@ static void check_verdicts(void)
         for (size_t len = 0; len < frame.len; len++)
             CHECK(parse(&frame, frame.bytes, len, &verdicts[i].request) == MD_INCOMPLETE);
         CHECK(parse(&frame, frame.bytes, frame.len, &verdicts[i].request) == verdicts[i].result);
+        if (frame.is_reply)
+            CHECK(verdicts[i].result <= md_longest_reply(frame.framing, &verdicts[i].request));
+    }
+}
+
+/* ---- which of several faults is reported ---- */
+
+static const struct {
+    const char *name, *bytes; /* the most specific fault is the reason, or else the first */
+    int framing, reason;
+    struct md_message request;
+} reasons[] = {
+    {"no byte", "", MD_RTU, MD_NO_REPLY, {.address = 1, .function = 3, .count = 2}},
+    {"no start", "30", MD_ASCII, MD_NO_START, {.address = 1, .function = 3, .count = 2}},
+    {"no start, another drive", "30 3A 30 32", MD_ASCII, MD_BAD_ADDRESS, {.address = 1, .function = 3,
+                                                            .count = 2}},
+    {"another function, another length", ":0104:010302", MD_ASCII, MD_BAD_LENGTH, {.address = 1,
+                                                            .function = 3, .count = 2}},
+    {"another length, no digit", ":010302:010304G0", MD_ASCII, MD_BAD_CHARACTER, {.address = 1,
+                                                            .function = 3, .count = 2}},
+    {"no digit, half a reply", ":010304G0:010304", MD_ASCII, MD_CUT_SHORT, {.address = 1, .function = 3,
+                                                            .count = 2}},
+    {"half a reply, another checksum", "01 03 04 01 83 02 00 00", MD_RTU, MD_BAD_CHECKSUM,
+     {.address = 1, .function = 3, .count = 2}},
+    {"another checksum, another value", ":010600101234A4\\r\\n:010600101235A2\\r\\n", MD_ASCII, MD_BAD_ECHO,
+     {.address = 1, .function = 6, .start = 0x10, .data_len = 2, .data = {0x12, 0x34}}},
+    {"another drive, another function", ":02:0104", MD_ASCII, MD_BAD_ADDRESS, {.address = 1,
+                                                            .function = 3, .count = 2}},
+    {"another function, another drive", ":0104:02", MD_ASCII, MD_BAD_FUNCTION, {.address = 1,
+                                                            .function = 3, .count = 2}},
+    {"another drive twice, half a reply", "00 01 00 00 00 03 02 83 02 00 02 00 00 00 03 02 83 02 00 03 00",
+     MD_TCP, MD_CUT_SHORT, {.address = 1, .function = 3, .count = 2}},
+    {"only a good reply", "00 01 00 00 00 03 01 83 02", MD_TCP, MD_INCOMPLETE, {.address = 1,
+                                                            .function = 3, .count = 2}},
+    {"no path to the drive", "00 01 00 00 00 03 01 83 0A", MD_TCP, MD_NO_REPLY, {.address = 1,
+                                                            .function = 3, .count = 2}},
+};
+
+static void check_reasons(void)
+{
+    for (size_t i = 0; i < COUNT(reasons); i++) {
+        uint8_t bytes[MD_MOST_FRAME];
+        size_t len = read_bytes(reasons[i].bytes, bytes);
+        row = reasons[i].name;
+        CHECK(md_reason(reasons[i].framing, &reasons[i].request, at_the_edge(bytes, len), len) ==
+              reasons[i].reason);
     }
 }
 
@@ -365,6 +434,7 @@ int main(int argc, char **argv)
     check_documents(argv[1]);
     check_builders();
     check_verdicts();
+    check_reasons();
     check_impossible_counts();
     return end_of_checks();
 }
