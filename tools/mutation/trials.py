@@ -58,7 +58,7 @@ def by_compiler(tree: Path, path: str) -> str | None:
 
 def by_test_frame(tree: Path, path: str) -> str | None:
     """Try a mutant with the Python tests of frames and of a line; `by_compiler` has compiled it already."""
-    _must(tree, CC, "-shared", *_objects(tree, "module", "_core"), "-o", "src/multidrop/_core.abi3.so")
+    _link(tree)
     return _pytest(
         tree, *(f"tests/core/test_{name}.py" for name in ("frame", "capture", "learning", "line", "tcp"))
     )
@@ -85,6 +85,10 @@ def core_names(tree: Path) -> list[str]:
 
 def _objects(tree: Path, directory: str, main: str) -> list[str]:
     return [f"{directory}/{name}.o" for name in (main, *core_names(tree))]
+
+
+def _link(tree: Path) -> None:
+    _must(tree, CC, "-shared", *_objects(tree, "module", "_core"), "-o", "src/multidrop/_core.abi3.so")
 
 
 def _pytest(tree: Path, *tests: str) -> str | None:
@@ -130,6 +134,7 @@ def scratch() -> Iterator[Path]:
         for name, source in {"_core": "module/_core.c", **sources}.items():
             _must(tree, CC, *MODULE, headers, "-c", source, "-o", f"module/{name}.o")
         shutil.copytree(tree / "module", tree / "original")
+        _link(tree)
         yield tree
 
 
