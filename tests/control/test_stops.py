@@ -432,6 +432,20 @@ def test_stops_of_a_line_do_not_each_wait_for_a_port_that_is_slow_to_open(
     assert line.seconds - begun < LEAST_S + 2 * 5
 
 
+def test_a_start_called_before_a_stop_is_not_sent_after_the_drive_is_attached_again() -> None:
+    line, (drive,), (sim,) = che_drives()
+    seen = drive.stops_called[0]
+    drive.stop()
+    line.bus.detach(drive)
+    line.attach(drive)
+    call = drive.begin_call("start", seen)
+    with pytest.raises(CancelledByStop):
+        drive.carry_out_move(drive.start.script(), call)
+    assert not sim.motor.energised
+    drive.start()
+    assert sim.motor.energised
+
+
 class Careless(Own):
     """A drive whose stop ignores every failure."""
 

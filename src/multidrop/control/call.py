@@ -44,7 +44,7 @@ class Latches:
         self.shut()
 
     def add(self, drive: Drive) -> Latch:
-        latch = self._latches[drive] = Latch()
+        latch = self._latches[drive] = Latch(drive.stops_called[0])
         # checked after the latch was added, so that a `shut` on another thread is never missed
         if self.is_shut:
             latch.shut(LEFT)

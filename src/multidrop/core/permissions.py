@@ -15,11 +15,12 @@ from multidrop.core.process import register_at_fork
 class Latch:
     """A drive's stop counter, which the core checks right before a request is sent.
 
-    `rise` takes no lock, so a signal handler may call it.
+    `count` is the number of stops so far: a drive that is attached again gets a new latch, which continues
+    the count. `rise` takes no lock, so a signal handler may call it.
     """
 
-    def __init__(self) -> None:
-        self.c: Any = ffi.new("uint32_t *")
+    def __init__(self, count: int = 0) -> None:
+        self.c: Any = ffi.new("uint32_t *", count)
         self.why = ""  # why permits were last invalidated; after `shut`, why all permits are invalid
         self._is_shut = False
         self._holds: set[object] = set()  # stops in progress, during which new permits are invalid
