@@ -35,7 +35,7 @@ def test_on_a_terminal_a_demo_shows_the_monitor_until_its_time_has_passed(tmp_pa
     out = tmp_path / "demo.arrows"
     with on_terminal("demo", "--out", out, "--seconds", 2, size=(120, 24)) as terminal:
         terminal.wait_for(">pump-1")
-        terminal.wait_for_match(r"belts +7 ")
+        terminal.wait_for_match(r"belts +8 ")
         terminal.wait_for("multidrop demo --web")
         terminal.wait_for(f"report {out}")
         terminal.wait_for("scan /dev/ttyUSB0")
