@@ -320,7 +320,7 @@ async def test_a_bucket_with_a_new_leader_is_handed_over(servers: Servers) -> No
     assert servers.leaders[names.LEASES[2]] == "n2"
 
 
-async def test_a_long_silent_server_is_ignored_until_it_returns(servers: Servers) -> None:
+async def test_a_server_that_stays_silent_is_ignored_until_it_returns(servers: Servers) -> None:
     servers.silent = {"n3"}
     servers.leaders[names.LEASES[2]] = "n1"
     await servers.pass_s(round(SILENT_FOR_S) + 5)
