@@ -196,7 +196,9 @@ class TomlPlace:
                     self.wrong(f"{name!r} is missing; add {key.example}")
             elif not key.takes(value):
                 if name not in meant:
-                    self.wrong(f"{name} = {_shown(value)} is not right; write {key.example}", name)
+                    self.wrong(
+                        f"{name} = {_shown(value)} is not right; write {_example(name, key, value)}", name
+                    )
             elif isinstance(value, str) and not value.isprintable():
                 self.wrong(f"{name} = {value!r} has unprintable characters; remove them", name)
             else:
@@ -207,10 +209,32 @@ class TomlPlace:
         """Add an error for each unknown key; return the known keys that were probably meant."""
         meant: set[str] = set()
         for name in [name for name in table if name not in keys]:
+            synonyms = [known for known in _SYNONYMS.get(name.lower(), ()) if known in keys]
             hint = did_you_mean(name, keys, f"the keys here are {', '.join(keys)}", 1)
-            meant.update(nearest_names(name, keys, 1))
+            if synonyms:
+                hint = f"did you mean {synonyms[0]}?"
+            meant.update(synonyms or nearest_names(name, keys, 1))
             self.wrong(f"unknown key {name!r}; {hint}", name)
         return meant
+
+
+def _example(name: str, key: Key, value: Any) -> str:
+    """Return what to write instead of an invalid value: the same number without quotes, or the example."""
+    is_quoted = isinstance(value, str) and value.isascii() and value.isdecimal() and key.takes(int(value))
+    return f"{name} = {int(value)}, without quotes" if is_quoted else key.example
+
+
+# the words of pymodbus, minimalmodbus and other programs for keys of multidrop's files
+_SYNONYMS: Mapping[str, tuple[str, ...]] = {
+    **dict.fromkeys(("parity", "stopbits", "bytesize"), ("format",)),
+    "baud": ("baudrate",),
+    **dict.fromkeys(("slave", "slave_id", "unit", "unit_id", "device_id", "id"), ("address",)),
+    **dict.fromkeys(("address", "addr", "register"), ("at",)),
+    **dict.fromkeys(("type", "data_type", "datatype"), ("number_format", "model")),
+    **dict.fromkeys(("scale", "factor", "multiplier"), ("step",)),
+    **dict.fromkeys(("byte_order", "word_order"), ("order",)),
+    **dict.fromkeys(("interval", "period"), ("every",)),
+}
 
 
 def _shown(value: Any) -> str:

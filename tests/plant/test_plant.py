@@ -296,9 +296,10 @@ def test_five_mistakes_in_one_plant_file_are_reported_together(mistakes: Mistake
             "line \"L\": format '8X1' is not data bits, parity and stop bits, such as 8N1, 8E1 or 7N2",
         ),
         (
-            HEAD + 'baudrate = "9600"\n' + TOY,
-            "line \"L\": baudrate = '9600' is not right; write baudrate = 9600",
+            HEAD + 'baudrate = "19200"\n' + TOY,
+            "line \"L\": baudrate = '19200' is not right; write baudrate = 19200, without quotes",
         ),
+        (HEAD + 'parity = "N"\n' + TOY, "line \"L\": unknown key 'parity'; did you mean format?"),
         (
             (HEAD + TOY).replace("= 1", "= true"),
             'line "L", drive "D": address = True is not right; write address = 1',
