@@ -167,6 +167,7 @@ class Poller(RowSource):
             for line in self._lines:
                 line.start()
             self._thread.start()
+            self._is_started = True
 
     def __exit__(self, kind: object, error: BaseException | None, *trace: object) -> None:
         self._end()

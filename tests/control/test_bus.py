@@ -23,6 +23,7 @@ from multidrop.drive.verbs import verb
 from multidrop.errors import BadReply, BusError, LineError, NoReply, NotAttached, Unconfirmed, WriteForbidden
 from multidrop.families import YD1000, DelixiModbus, DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.families.innovert_ibd import IBDControl
+from multidrop.plant.model import Plant, PlantLine, PolledDrive
 from multidrop.poller import Poller
 from multidrop.sim import EncodedDrive, SimulatedDrive, Simulator, Wire, simulated
 from multidrop.transport import peers
@@ -199,6 +200,10 @@ MISTAKES: dict[type[Exception], list[tuple[Callable[[Bus, Any], Any], str]]] = {
             lambda bus, rig: rig.write(YD1000.acceleration_time, 5.0),
             "this acceleration_time is not a register of pump, which is a Rig",
         ),
+        (
+            lambda bus, rig: bus.attach(Toy, 2, name=cast(Any, 5)),
+            "the name 5 is not one line of printable characters",
+        ),
         (lambda bus, rig: rig.read("targets"), "Rig has no register 'targets'; did you mean target?"),
         (lambda bus, rig: rig.write("targets", 5.0), "Rig has no register 'targets'; did you mean target?"),
     ],
@@ -246,6 +251,31 @@ MISTAKES: dict[type[Exception], list[tuple[Callable[[Bus, Any], Any], str]]] = {
         (
             lambda bus, rig: Poller(cast(Any, 5)),
             "Poller takes a Plant or a plant file such as 'plant.toml', not 5",
+        ),
+        (lambda bus, rig: rig.read(["speed", "gain"]), "drive.register(NAME); several as separate arguments"),
+        (
+            lambda bus, rig: Plant(cast(Any, "plant.toml")),
+            "Plant takes lines; to load a plant file, write Plant.load('plant.toml')",
+        ),
+        (
+            lambda bus, rig: Plant(cast(Any, PlantLine("a", "/dev/a"))),
+            "Plant takes lines as a list of PlantLine objects, not PlantLine(",
+        ),
+        (
+            lambda bus, rig: PlantLine("a", "/dev/a", drives=cast(Any, [rig])),
+            "PlantLine takes drives as a list of PolledDrive objects, not [<Rig",
+        ),
+        (
+            lambda bus, rig: PlantLine("a", "/dev/a", cast(Any, [PolledDrive(rig)])),
+            "a line's baud rate is a whole number, not [PolledDrive(",
+        ),
+        (
+            lambda bus, rig: PolledDrive(cast(Any, Rig)),
+            "PolledDrive takes a drive such as YD1000(1), not <class",
+        ),
+        (
+            lambda bus, rig: PolledDrive(rig, "speed"),
+            "PolledDrive takes a list of registers, such as ['output_current'], not a single one",
         ),
     ],
 }

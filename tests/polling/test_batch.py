@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import nanoarrow
 import pyarrow as pa
@@ -52,6 +52,11 @@ def test_batch_at_returns_the_rows_at_the_given_indices(places: list[int]) -> No
     found = example().at(places)
     assert list(found) == wanted
     assert rows_of(pa.record_batch(found)) == wanted
+
+
+def test_columns_of_the_wide_form_in_a_list_raise_type_error() -> None:
+    with pytest.raises(TypeError, match=r"wide takes names of columns as separate arguments, not \['"):
+        example().wide(cast(Any, ["pump-1.speed"]))
 
 
 def test_pyarrow_reads_a_batch() -> None:

@@ -197,6 +197,19 @@ def test_batches_yields_rows_for_the_given_seconds(port: str) -> None:
         assert all(row.uncertainty_ns is not None and row.uncertainty_ns > 0 for row in samples)
 
 
+def test_iterating_before_the_with_block_raises_instead_of_waiting_forever(port: str) -> None:
+    async def first(poller: Poller) -> None:
+        async for _ in poller:
+            break
+
+    poller = Poller(plant(line(port, polled(drive(), READINGS))))
+    for iterate in (iter, Poller.batches, lambda poller: asyncio.run(first(poller))):
+        with pytest.raises(ValueError, match="does not poll yet: iterate over it inside `with poller:`"):
+            iterate(poller)
+    poller.close()
+    assert list(poller) == []
+
+
 def test_leaving_a_loop_over_batches_early_is_allowed(port: str) -> None:
     with Poller(plant(line(port, polled(drive(), READINGS)))) as poller:
         assert len(next(poller.batches())) > 0

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from datetime import datetime
 from itertools import chain
 from pathlib import Path
+from typing import Any, cast
 
 import pyarrow as pa
 import pyarrow.parquet
@@ -23,6 +24,7 @@ from recordings import FILE_SCHEMA, SCHEMA, is_kept, record_as_before, rows_of
 from tables import table
 
 from multidrop.core import Columns, Names, Status
+from multidrop.plant.model import Plant
 from multidrop.polling.batch import Batch, Row, Rows
 from multidrop.recording import (
     FORMATS,
@@ -406,6 +408,8 @@ def test_metadata_that_json_cannot_hold_raises_type_error(tmp_path: Path, suffix
     path = record(tmp_path / f"a{suffix}")
     with pytest.raises(TypeError, match="not JSON serializable"):
         open_writer(path, {"drives": object()})
+    with pytest.raises(TypeError, match=r"takes metadata as a dict, such as plant.metadata\(\), not Plant\("):
+        open_writer(path, cast(Any, Plant([])))
     assert rows(open_recording(path)) == RECORDED
 
 

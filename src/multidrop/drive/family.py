@@ -244,7 +244,7 @@ class Drive(RegisterAccess):
             self.response_delay, self.response_delay_characters * self.settings.character
         )
         self.name = name or f"{self.model or type(self).__name__}@{address}"
-        if not self.name.isprintable():  # a line break would split a row of a .csv recording
+        if not (isinstance(self.name, str) and self.name.isprintable()):  # a line break would split a row
             raise ValueError(f"the name {name!r} is not one line of printable characters")
         self.option = checked_options(self._kind(), self.options, options)
         self.ram = frozenset(self._in_ram(name) for name in ram)
@@ -574,7 +574,7 @@ def check_own(drive: Drive, register: Register[Any]) -> None:
     """
     check_drive(drive)
     if not isinstance(register, Register):
-        hint = "use an attribute of the drive, or drive.register(NAME)"
+        hint = "use an attribute of the drive, or drive.register(NAME); several as separate arguments"
         raise TypeError(f"{register!r} is not a Register of {drive.name}: {hint}")
     is_parameter = isinstance(register, Parameter) and isinstance(drive, register.family)
     if not is_parameter and drive.registers.get(register.name) is not register:

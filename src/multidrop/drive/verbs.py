@@ -324,7 +324,7 @@ class _BoundStop(_BoundVerb[P, R]):
         try:
             signature(self._script).bind(self.drive, *args, **kwargs)
         except TypeError as mistake:
-            return mistake
+            return TypeError(f"{self.name} of {self.drive.name}: {mistake}")
         return None
 
 

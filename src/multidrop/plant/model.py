@@ -9,7 +9,7 @@ from enum import Flag
 from importlib import import_module
 from itertools import product
 from pathlib import Path
-from typing import Any, Final, NoReturn
+from typing import Any, Final, NoReturn, TypeVar
 from unicodedata import normalize
 
 import multidrop
@@ -21,7 +21,7 @@ from multidrop.drive.register import Register
 from multidrop.drive.verbs import LISTED_VERBS
 from multidrop.planning.blocks import Planned, planned
 from multidrop.planning.prediction import predict, prediction_metadata
-from multidrop.printable import did_you_mean
+from multidrop.printable import did_you_mean, is_whole
 from multidrop.toml_check import Key, TomlPlace, check_period, json_schema
 
 _VERB = f"({'|'.join(LISTED_VERBS)})"
@@ -48,6 +48,9 @@ MAY_KEYS: Final = {
     ),
 }
 FLEET_KEYS: Final = {"may": Key(dict, "[fleet.may], a table", keywords=json_schema(MAY_KEYS))}
+
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -87,6 +90,12 @@ class PolledDrive:
         every: float | None = None,
         channels: Iterable[Channel] = (),
     ) -> None:
+        if not isinstance(drive, Drive):
+            raise TypeError(f"PolledDrive takes a drive such as YD1000(1), not {drive!r}")
+        if isinstance(polls, (str, Register, Polled)):
+            raise TypeError(
+                "PolledDrive takes a list of registers, such as ['output_current'], not a single one"
+            )
         wanted = drive.readings() if polls is None else polls
         object.__setattr__(self, "drive", drive)
         object.__setattr__(self, "polls", tuple(_polled(drive, one, every) for one in wanted))
@@ -131,6 +140,14 @@ def _polled(drive: Drive, wanted: Polled | Register[Any] | str, every: float | N
     return Polled(drive.register(wanted) if isinstance(wanted, str) else wanted, every)
 
 
+def _all_of(kind: type[T], given: Iterable[T], right: str) -> tuple[T, ...]:
+    """Return the given objects as a tuple. Raises TypeError unless they are a list of this class."""
+    found = tuple(given) if isinstance(given, Iterable) else ()
+    if isinstance(given, Iterable) and all(isinstance(one, kind) for one in found):
+        return found
+    raise TypeError(f"{right} as a list of {kind.__name__} objects, not {given!r}")
+
+
 @dataclass(frozen=True)
 class PlantLine:
     """A port with its drives. The drives' settings already include the line's baud rate and format."""
@@ -147,7 +164,9 @@ class PlantLine:
     settle: float = 0.0  # s of silence after the port is opened
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "drives", tuple(self.drives))
+        if self.baudrate is not None and not is_whole(self.baudrate):
+            raise TypeError(f"a line's baud rate is a whole number, not {self.baudrate!r}")
+        object.__setattr__(self, "drives", _all_of(PolledDrive, self.drives, "PlantLine takes drives"))
 
     def at(self, port: str) -> PlantLine:
         """Return a copy of the line at another port, without `rs485` if the new port is a network port."""
@@ -168,7 +187,9 @@ class Plant:
     totals: Path | None = None  # file with the totals of channels; None: the default file, see `totals_path`
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "lines", tuple(self.lines))
+        if isinstance(self.lines, (str, Path)):
+            raise TypeError(f"Plant takes lines; to load a plant file, write Plant.load({str(self.lines)!r})")
+        object.__setattr__(self, "lines", _all_of(PlantLine, self.lines, "Plant takes lines"))
 
     @classmethod
     def load(cls, path: Path | str) -> Plant:

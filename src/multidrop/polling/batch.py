@@ -110,6 +110,9 @@ class WideRows(ArrowTable):
         `known` are valid columns that may have no row. Raises ValueError for an unknown column, and if two
         registers would have the same column name.
         """
+        for name in chosen:
+            if not isinstance(name, str):
+                raise TypeError(f"wide takes names of columns as separate arguments, not {name!r}")
         self._columns = {name: _WideColumn() for name in chosen}
         self._times: dict[tuple[int, int], int] = {}  # row numbers by (time, monotonic_ns)
         self._starts = array("q")  # by row number: the number of restarts of the computer before the row

@@ -139,6 +139,7 @@ class RowSource:
         self._wakeup = WakeUp()
         self._is_watched = False  # True once `fileno` was called: its descriptor is then kept up to date
         self._taken_ns = 0  # when rows were last taken from a chunk that was not full
+        self._is_started = False  # True once polling has started
         self._closing = False
         self._over = threading.Event()  # set once all lines are closed, so that no further rows come
         self._caller: BatchCaller | None = None
@@ -197,8 +198,16 @@ class RowSource:
         `every` None means 0.1 s, or 0.02 s if realtime scheduling was granted.
 
         Once the poller is closed, the remaining batches are yielded immediately. Raises PollingFailed like
-        `take`.
+        `take`, and ValueError before the `with` block, because no rows would come.
         """
+        self._check_started()
+        return self._yield_batches(seconds, every)
+
+    def _check_started(self) -> None:
+        if not (self._is_started or self._closing):
+            raise ValueError("this poller does not poll yet: iterate over it inside `with poller:`")
+
+    def _yield_batches(self, seconds: float | None, every: float | None) -> Iterator[Batch]:
         end_ns = None if seconds is None else clock.now_ns() + round(seconds * 1e9)
         is_over = False
         while not is_over and (end_ns is None or clock.now_ns() < end_ns):
@@ -216,8 +225,9 @@ class RowSource:
         """Yield batches until the poller is closed, without blocking the event loop.
 
         A batch is taken only when it is yielded. So if the task is cancelled, queued rows stay for the next
-        consumer, even after the poller is closed.
+        consumer, even after the poller is closed. Raises ValueError before the `with` block.
         """
+        self._check_started()
         import asyncio  # imported here: only `async for` needs its 4 MB
 
         is_over = False
@@ -245,7 +255,7 @@ class RowSource:
                 raise ValueError("on_batch already has a function")
             if self._closing:
                 raise ValueError("polling has ended: there are no more batches")
-            self._caller = BatchCaller(self.batches(every=every), function)
+            self._caller = BatchCaller(self._yield_batches(None, every), function)
 
     def _call_thread(self) -> None:
         self._row_queue.call(NO_LINE)

@@ -50,7 +50,7 @@ from __future__ import annotations
 
 import importlib
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +78,8 @@ def open_writer(
     Raises FileExistsError if there is a file at `path`, ValueError for another suffix, TypeError for
     metadata that JSON cannot hold, and RecordingError if the file cannot be written.
     """
+    if not isinstance(metadata, Mapping):
+        raise TypeError(f"open_writer takes metadata as a dict, such as plant.metadata(), not {metadata!r}")
     place = Path(path)
     module = _format(place)
     if overwrite:
