@@ -507,7 +507,7 @@ def when_asked(bus: Bus, act: Callable[[], object]) -> None:
     vars(bus.line)["carry_out"] = act_and_carry_out
 
 
-def test_a_read_of_several_requests_ends_if_its_drive_is_detached() -> None:
+def test_detaching_a_drive_ends_a_read_that_needs_several_requests() -> None:
     with Simulator([Wire([simulated(Single(1))], unpaced=True)]) as sim, Bus(sim.wires[0].path) as bus:
         pump = bus.attach(Single, 1)
         peer = bus.peer(pump)

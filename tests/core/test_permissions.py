@@ -155,7 +155,7 @@ def test_the_kernel_kills_a_suspended_process_half_a_guard_time_after_its_deadli
 
 
 @pytest.mark.slow
-def test_a_process_that_extends_its_mastership_in_time_is_not_killed() -> None:
+def test_a_process_that_renews_its_lease_in_time_is_not_killed() -> None:
     then = (
         "for n in range(40):\n"
         " mastership.extend(time.clock_gettime_ns(time.CLOCK_BOOTTIME) + 4 * 10**9)\n"

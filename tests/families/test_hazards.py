@@ -336,7 +336,7 @@ class Mine(InvtCHE):
 
 
 @pytest.mark.parametrize("hazard", HAZARDS.values(), ids=HAZARDS)
-def test_dangerous_action_sends_only_the_safe_frames_or_is_refused(hazard: Hazard) -> None:
+def test_hazardous_command_sends_only_documented_safe_frames_or_is_refused(hazard: Hazard) -> None:
     line, drive, sim = one(hazard.drive())
     for name, value in hazard.shows.items():
         sim[name] = value

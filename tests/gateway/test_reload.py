@@ -433,7 +433,9 @@ dc_bus_voltage = { at = 0x3002, unit = "A", step = 0.5, place = "1" }
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_values_never_get_the_unit_of_a_new_drive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_old_values_never_get_the_unit_of_measurement_of_a_new_drive(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The new drive has another family. It is polled already while another line is still being opened."""
     (tmp_path / "other.toml").write_text(OTHER)
     with two_lines(tmp_path, "[serve.history]\n" + MAY) as (gateway, _):

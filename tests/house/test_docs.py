@@ -385,7 +385,7 @@ def test_every_public_name_is_in_the_reference(package: str, monkeypatch: pytest
 
 
 @pytest.mark.parametrize("page", ["index.md", "reference/api.md"])
-def test_entry_pages_are_plain_markdown(page: str) -> None:
+def test_index_and_api_pages_are_plain_markdown(page: str) -> None:
     """A code host shows directives and definition lists as raw text."""
     text = (DOCS / page).read_text("utf-8")
     assert re.findall(r"^```\{.*|^: .*|^:::.*", text, re.MULTILINE) == []

@@ -140,7 +140,7 @@ class Worker:
         self.gateway._look_for_events()
 
     def statistics(self) -> None:
-        """Read the statistics of the exchanges of one second."""
+        """Do what the gateway does once a second: read the statistics of all exchanges."""
         turn = next(self._turns)
         delays = Counter(dict.fromkeys(range(60, 75), turn))
         of_drive = Counters(turn, turn, 10 * turn, turn, ideal_ns=turn, missed=Counter({Status.NO_REPLY: 1}))

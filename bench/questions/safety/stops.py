@@ -36,7 +36,7 @@ REFUSALS: dict[str, tuple[int, ...]] = {  # exception codes that answer a stop's
 }
 MOST_READS = 8  # limit of the reads that a start makes before its write
 LATE, PATIENCE = 0.6, 3.0  # s: delay that makes replies too late to confirm a stop; limit for a stop
-CUT_SHORT = "cut short"  # words in the output of a client whose stops were aborted
+CUT_SHORT = "cut short"  # printed by a client if a third signal cuts its stops short
 PAUSE = 2.5  # s; longer than the expiry of a start, and than each of its reads
 Attack = Callable[[random.Random, int, bool], Counters]
 

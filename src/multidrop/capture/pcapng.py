@@ -16,7 +16,7 @@ from multidrop.core import Side, Stream, Unpacked, Unpacker, Wrappings
 from multidrop.recording.format import AppendFile, RecordingError, writing
 
 EXPORTED_PDU = 252
-APPLICATION = b"multidrop"  # start of the application name in captures of this library
+APPLICATION = b"multidrop"  # start of the application name in files that this library writes
 
 SECTION, INTERFACE = 0x0A0D0D0A, 1
 _END, _COMMENT = 0, 1

@@ -196,7 +196,7 @@ class Call:
     def noted(self) -> Iterator[None]:
         """Log a WriteForbidden from the block; on Ctrl-C, add a note on the writes already sent.
 
-        If the call was cancelled because a signal stops the drives, raise what the signal raises, such as
+        If a signal that stops the drives has cancelled the call, raise the signal's own exception, such as
         KeyboardInterrupt.
         """
         try:

@@ -105,7 +105,7 @@ class Reload:
             return result
 
     async def _read_within(self, read: Read) -> tuple[Plant, ServeSettings, Mapping[str, Any]]:
-        """Return the plant in the file, its settings, and the plan of its lines.
+        """Read the file; return its plant, its settings, and how the lines will be polled.
 
         Raises Hung if reading takes too long, or if a later reload is waiting to read the file.
         """

@@ -48,7 +48,7 @@ class Sweep:
 
     settings: Settings
     framing: Framing
-    families: tuple[type[Drive], ...]  # families whose documents say that they answer the request
+    families: tuple[type[Drive], ...]  # families that answer this sweep's request, by their documents
     request: ScanRequest
     addresses: tuple[int, ...]
     silence: float

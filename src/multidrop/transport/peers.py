@@ -113,7 +113,7 @@ class Peers:
         return peer
 
     def close(self) -> None:
-        """Close the line; late replies still due are remembered for the next opening of the port."""
+        """Close the line. If it is opened again, replies that are still due then count as late."""
         names = self._names()
         self._line.close()
         remember_former_peers(names, [(address, peer) for (address, *_), peer in self._known.items()])

@@ -184,7 +184,9 @@ def plant_at(arguments: argparse.Namespace) -> Plant | None:
         return plant_of(arguments.port, arguments)
     check_port(arguments.port)
     if arguments.ports:
-        raise ValueError("--port is for the lines of a plant file: write the port in place of PORT")
+        raise ValueError(
+            "--port is for the lines of a plant file; without a plant file, name the port as the first argument"
+        )
     if arguments.name is not None:
         raise mistaken(arguments, f"unrecognized arguments: {arguments.name}")
     return None
@@ -288,7 +290,9 @@ def target_of(arguments: argparse.Namespace) -> tuple[Target, list[str]]:
         return _by_plant(arguments), words[len(_BY_PLANT) :]
     check_words(arguments, words[: len(_BY_PORT)], _BY_PORT)
     if arguments.ports:
-        raise ValueError("--port is for the lines of a plant file: write the port in place of PORT")
+        raise ValueError(
+            "--port is for the lines of a plant file; without a plant file, name the port as the first argument"
+        )
     return _by_port(arguments), words[len(_BY_PORT) :]
 
 

@@ -66,7 +66,7 @@ def build(settings: TriggerSettings, context: PartContext) -> Triggers:
 
 
 class Trigger(NamedTuple):
-    """The moment at which a condition became true, UTC in ns, and the registers that it names."""
+    """When a condition became true (UTC in ns), and the registers in the condition."""
 
     name: str
     condition: str
@@ -153,7 +153,7 @@ class _Conditions:
         # by drive and register code: the index of an input of the conditions
         self._slots: dict[tuple[int, int], int] = {}
         self._sizes = (0, 0)  # how many drive names and register names the newest batch has
-        self._was: dict[int, bool] = {}  # by index of a condition: whether the condition was true
+        self._was: dict[int, bool] = {}  # whether each condition, by its index, was true before
 
     def triggers(self, batch: Batch) -> Iterator[Trigger]:
         """Yield a trigger for each condition that changes from false to true within this batch."""

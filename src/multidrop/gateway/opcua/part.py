@@ -131,7 +131,7 @@ class OpcUa:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._serving: asyncio.Future[None] | None = None  # done when the server's thread has ended
         self._opened: tuple[asyncio.AbstractEventLoop, asyncio.Event, PlantNodes] | None = None
-        self._is_over = False  # True: the server must end now, or as soon as it is open
+        self._is_over = False  # True: end the server; if it is still starting, once it has started
         # pending while the server takes over a new plant or new values
         self._writing: Future[None] | None = None
 
