@@ -145,8 +145,8 @@ class ModbusDevice(Drive):
 
         If the device refuses to be read back, the written coils are returned. Raises as `write_holding`.
 
-        One coil is written by function 5, several by function 15. With `multiple`, function 15 writes one coil
-        too.
+        One coil is written by function 5, several by function 15. With `multiple`, function 15 also writes
+        one coil.
         """
         coils = values if isinstance(values, Sequence) else [values]
         for coil in coils:

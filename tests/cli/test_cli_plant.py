@@ -120,7 +120,7 @@ def test_a_mistaken_name_or_option_is_shown(run: Run, plant: Path, words: list[s
 
 
 def test_options_for_plant_files_are_refused_without_a_plant_file(run: Run) -> None:
-    sentence = "multidrop: --port is for the lines of a plant file: write the port in place of PORT\n"
+    sentence = "multidrop: --port is for a plant file; without a plant file, the first argument is the port\n"
     for words in (("read", "/dev/none", TOY, 1), ("scan", "/dev/none"), ("doctor", "/dev/none")):
         assert run(*words, "--port=a=b") == (2, "", sentence)
 

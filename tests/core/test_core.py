@@ -732,7 +732,7 @@ def test_cut_off_is_true_only_if_the_port_is_lost_after_a_reply(answered: int, w
         if way == "queued":
             until(lambda: port.done == answered + 1)
         else:
-            assert port.repeat([]) == 1  # the second exchange of the round was not answered, so it comes next
+            assert port.repeat([]) == 1  # comes next, because it got no reply
 
 
 def test_a_pty_whose_far_end_hangs_up_is_lost() -> None:

@@ -61,7 +61,7 @@ def find_model(text: str, relative_to: Path | None = None) -> type[Drive]:
     if not colon and text.endswith(".py"):
         path = text
     if not path.endswith(".py"):
-        # Only names that are no paths come here, because the search reads the list of all installed packages.
+        # only for names, not for paths: the search reads the list of all installed packages
         if found := installed_family(text):
             return found
         known = (*MODELS, *SHIPPED, *installed_models())

@@ -184,9 +184,7 @@ def plant_at(arguments: argparse.Namespace) -> Plant | None:
         return plant_of(arguments.port, arguments)
     check_port(arguments.port)
     if arguments.ports:
-        raise ValueError(
-            "--port is for the lines of a plant file; without a plant file, name the port as the first argument"
-        )
+        raise ValueError("--port is for a plant file; without a plant file, the first argument is the port")
     if arguments.name is not None:
         raise mistaken(arguments, f"unrecognized arguments: {arguments.name}")
     return None
@@ -290,9 +288,7 @@ def target_of(arguments: argparse.Namespace) -> tuple[Target, list[str]]:
         return _by_plant(arguments), words[len(_BY_PLANT) :]
     check_words(arguments, words[: len(_BY_PORT)], _BY_PORT)
     if arguments.ports:
-        raise ValueError(
-            "--port is for the lines of a plant file; without a plant file, name the port as the first argument"
-        )
+        raise ValueError("--port is for a plant file; without a plant file, the first argument is the port")
     return _by_port(arguments), words[len(_BY_PORT) :]
 
 

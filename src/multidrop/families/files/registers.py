@@ -419,7 +419,7 @@ class Declared:
     def _addresses(
         self, given: Mapping[str, Any], good: dict[str, Any], place: TomlPlace, read: ReadAddress
     ) -> tuple[int, str] | None:
-        """Return the register's address and table; None if they are invalid. Also converts `good["ram_address"]`."""
+        """Return the register's address and table, None if invalid; also convert `ram_address` in `good`."""
         if "at" not in given or ("table" in given and "table" not in good):
             good.pop("ram_address", None)
             return None
