@@ -94,6 +94,10 @@ def test_the_help_imports_no_command_and_no_large_library() -> None:
             ["read", "/dev/ttyX"],
             "the following arguments are required: MODEL, ADDRESS; see `multidrop read --help`",
         ),
+        (
+            ["read", "/dev/ttyX", TOY, "1", "--baud", "9600"],
+            "unrecognized arguments: --baud 9600; did you mean --baudrate?; see `multidrop read --help`",
+        ),
         (["schema"], "the following arguments are required: KIND; see `multidrop schema --help`"),
         (
             ["read", "/dev/ttyX", TOY, "one"],

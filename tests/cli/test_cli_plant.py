@@ -343,7 +343,7 @@ def test_a_family_file_in_place_of_a_plant_file_is_refused(run: Run, tmp_path: P
     (tmp_path / "meter.toml").write_text(METER)
     status, out, err = run("read", tmp_path / "meter.toml", "meter-1")
     assert (status, out) == (2, "")
-    assert "'line' is missing; add [[line]]" in err
+    assert "meter.toml: this is a family file, not a plant file" in err
 
 
 @pytest.mark.parametrize("words", [[], ["--all"], ["--line", "hall-1"]])

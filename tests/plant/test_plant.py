@@ -491,6 +491,15 @@ def test_url_or_port_name_instead_of_a_plant_file_is_reported(name: str, expecte
         assert expected in str(raised.value)
 
 
+def test_family_file_given_as_plant_file_is_reported_in_one_sentence(tmp_path: Path) -> None:
+    path = tmp_path / "meter.toml"
+    path.write_text('[family]\ntitle = "Meter"\n\n[reading]\nvoltage = { at = "30001" }\n')
+    with pytest.raises(PlantError) as raised:
+        load_plant(path)
+    (sentence,) = raised.value.mistakes
+    assert sentence.startswith(f"{path}: this is a family file, not a plant file")
+
+
 def test_device_path_given_as_plant_file_is_not_read() -> None:
     """Reading a serial port would block, and take bytes from its line."""
     with pytest.raises(PlantError, match=r": this is a device, not a plant file$"):

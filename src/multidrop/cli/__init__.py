@@ -16,7 +16,7 @@ from functools import partial
 from typing import Any, NoReturn
 
 from multidrop.errors import BusError, Unsupported, WriteForbidden
-from multidrop.printable import did_you_mean
+from multidrop.printable import did_you_mean, nearest_names
 
 DONE, FAILED, MISTAKE, INTERRUPTED = 0, 1, 2, 130
 # Commands that continue after SIGHUP. Invalid arguments after the drive's name do not prevent them.
@@ -226,6 +226,12 @@ class _Parser(argparse.ArgumentParser):
         raise ValueError(f"{message}; see `{self.prog} --help`")
 
 
+def _option_hint(parser: argparse.ArgumentParser, word: str) -> str:
+    known = [option for action in parser._actions for option in action.option_strings]
+    near = nearest_names(word.partition("=")[0], known, 1) if word.startswith("--") else []
+    return f"; did you mean {near[0]}?" if near else ""
+
+
 def _parsed(
     parser: argparse.ArgumentParser, words: list[str], command: str
 ) -> tuple[argparse.Namespace, list[str]]:
@@ -239,7 +245,7 @@ def _parsed(
     if not unknown:
         return arguments, []
     if command not in STOPS:
-        parser.error(f"unrecognized arguments: {' '.join(unknown)}")
+        parser.error(f"unrecognized arguments: {' '.join(unknown)}{_option_hint(parser, unknown[0])}")
     options = [word for word in unknown if word.startswith("-")]
     kept: list[str] = []
     left_out: list[str] = []

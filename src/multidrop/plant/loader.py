@@ -77,6 +77,8 @@ def _load(path: Path | str, keys_of: Callable[[Mapping[str, Any]], Mapping[str, 
     path = Path(path)
     place = TomlPlace.in_file(path)
     document = place.attempt(read_document, path, "plant file")
+    if document and "family" in document and "line" not in document:
+        raise PlantError((f"{path}: {_FAMILY_FILE}",))
     given = {} if document is None else _tables(document, keys_of(document), place)
     lines = [_line(table, at) for table, at in place.inside("line", given.get("line", []))]
     right = tuple(line for line in lines if line is not None)
@@ -97,6 +99,7 @@ def _tables(document: dict[str, Any], keys: Mapping[str, Key], place: TomlPlace)
     return place.check({name: one for name, one in document.items() if name not in _INNER}, keys)
 
 
+_FAMILY_FILE = "this is a family file, not a plant file; name it as the model of a drive in a plant file"
 _INNER = {"drive": "[[line.drive]]", "channel": "[[line.drive.channel]]"}
 
 
