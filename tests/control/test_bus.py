@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 import threading
 from collections.abc import Callable
@@ -175,6 +176,20 @@ def test_a_value_that_the_eeprom_already_holds_is_not_written() -> None:
         assert ours.write(ours.limit, 12.5) == 12.5
         assert ours.write(ours.limit, 12.5) == 12.5
     assert rig.counters.eeprom_writes == {"limit": 1}
+
+
+class Meter(Drive):
+    """A device without a motor."""
+
+    has_motor = False
+    voltage = reading(0, "V", step=1)
+
+
+def test_no_watchdog_is_logged_for_a_device_without_a_motor(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "multidrop.control")
+    with unpaced(simulated(Meter(1))) as sim, Bus(path(sim)) as bus:
+        bus.check_identity(bus.attach(Meter, 1))
+    assert [record.getMessage() for record in caplog.records] == []
 
 
 MISTAKES: dict[type[Exception], list[tuple[Callable[[Bus, Any], Any], str]]] = {

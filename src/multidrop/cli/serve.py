@@ -131,6 +131,8 @@ def blind_spots(plant: Plant) -> list[str]:
         drive, polled = one.drive, [poll.register.name for poll in one.polls]
         if not can_show_fault(drive, polled):
             others = [each.name for each in drive.readings() if can_show_fault(drive, [*polled, each.name])]
+            if not (others or drive.has_motor):
+                continue
             advice = f"poll {' or '.join(others[:3])} too" if others else "its family has no such register"
             found.append(f"{drive.name}: no polled register can show a fault: {advice}")
     return found

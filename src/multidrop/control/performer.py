@@ -105,7 +105,7 @@ class Performer:
             return self._writer.raw(drive, request, call)
 
     def check_identity(self, drive: Drive, rest_s: float = 0.0) -> None:
-        """Check a drive's declared family and log its `watchdog` sentence, unless this was done before.
+        """Check a drive's declared family, unless this was done before. Log its `watchdog` if it has a motor.
 
         `rest_s` is a pause in s before each read.
         """
@@ -121,7 +121,7 @@ class Performer:
             return call.look()
 
         identity_check.check(drive, look if rest_s else call.look)
-        if is_first:
+        if is_first and drive.has_motor:
             with call.look():
                 _log.info("%s: %s", drive.name, self.watchdog(drive))
 

@@ -17,7 +17,8 @@ from gateways import POLL, Served, plant_text, running, served, written
 from lines import until
 from tables import table
 
-from multidrop import BusError, Plant, PlantError, WriteForbidden
+from multidrop import BusError, Drive, Plant, PlantError, PlantLine, PolledDrive, WriteForbidden, reading
+from multidrop.cli.serve import blind_spots
 from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout
 from multidrop.drive import can_show_fault
 from multidrop.errors import Advice
@@ -131,6 +132,15 @@ def test_serve_check_warns_if_no_polled_register_can_show_a_fault(run: Run, tmp_
     advice = "no polled register can show a fault: poll status or fault too"
     assert (status, errors.count("\n")) == (0, 1)
     assert f"pump-1: {advice}" in errors
+
+
+def test_a_device_without_a_motor_or_a_fault_register_causes_no_warning() -> None:
+    class Meter(Drive):
+        has_motor = False
+        voltage = reading(0, "V", step=1)
+
+    meter = PolledDrive(Meter(1))
+    assert blind_spots(Plant([PlantLine("hall", "/dev/a", drives=[meter])])) == []
 
 
 RUNS, STANDS = Shown("runs", None), Shown("stands", None)
