@@ -7,7 +7,7 @@ from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from lines import PATIENCE
@@ -344,6 +344,17 @@ def test_an_invalid_gap_starts_no_motor() -> None:
     for gap in (-1.0, float("nan"), float("inf")):
         with pytest.raises(ValueError, match=r"^gap = .* s: it must be 0 or more$"):
             start_staggered([drive, drive], gap)
+    assert line.frames == []
+
+
+def test_wrong_arguments_of_a_ramp_raise_type_error_before_any_frame() -> None:
+    line, drive, _ = one(YD1000(1))
+    with pytest.raises(TypeError, match="is not a drive: use the one that attach returns"):
+        ramp(cast(Any, [drive]), 20.0)
+    with pytest.raises(TypeError, match="rate = '1' is not a number"):
+        ramp(drive, 20.0, rate=cast(Any, "1"))
+    with pytest.raises(TypeError, match="every = None is not a number"):
+        ramp(drive, 20.0, every=cast(Any, None))
     assert line.frames == []
 
 

@@ -11,11 +11,12 @@ from math import inf
 from multidrop.control.call import Call
 from multidrop.control.rules import conditions, raw_count, wears
 from multidrop.core import PAUSE_NS
-from multidrop.drive.family import Drive
+from multidrop.drive.family import Drive, check_drive
 from multidrop.drive.register import Kept, Register
 from multidrop.drive.state import Direction
 from multidrop.drive.verbs import Script, Write, read, wait
 from multidrop.errors import NotAttached, WriteForbidden
+from multidrop.printable import is_number
 from multidrop.transport import clock
 
 # s between reads of waiting drives: a drive silent for PAUSE_NS may have lost its power (identity.py)
@@ -121,8 +122,13 @@ def ramp(drive: Drive, hz: float, *, rate: float | None = None, every: float = 0
 
     The default and highest rate is the drive's own: maximum frequency / acceleration time. Raises
     WriteForbidden if each step may be stored in EEPROM, or if the rate is unknown. If `hz` is not allowed,
-    raises the error of `set_frequency` before the first step.
+    raises the error of `set_frequency` before the first step. Raises TypeError for a wrong argument.
     """
+    check_drive(drive)
+    if not is_number(every):
+        raise TypeError(f"every = {every!r} is not a number of seconds")
+    if not (rate is None or is_number(rate)):
+        raise TypeError(f"rate = {rate!r} is not a number in Hz/s")
     drive.perform(_ramp(drive, hz, rate, every))
 
 
