@@ -180,6 +180,18 @@ def test_queued_requests_count_towards_the_planning_horizon() -> None:
     assert len(made.take(0, 90 * MS, 100 * MS, 9)) == 2
 
 
+@pytest.mark.parametrize(("silence", "end_ms"), [({}, 25), ({"silence_ns": 2 * MS}, 23)])
+def test_silence_of_a_request_takes_no_time_if_the_line_was_idle(
+    silence: dict[str, int], end_ms: int
+) -> None:
+    """The line is idle from 15 to 20 ms, when the second slots start."""
+    for later_ns, planned in ((0, 1), (1, 2), (5 * MS, 2), (5 * MS + 1, 3)):
+        jobs = [Job(drive=drive, period_ns=20 * MS, duration_ns=5 * MS, **silence) for drive in (1, 2, 3)]
+        made = schedule(*jobs)
+        assert len(made.take(0, 0, 15 * MS, 9)) == 3
+        assert len(made.take(15 * MS, 15 * MS, end_ms * MS + later_ns, 9)) == planned
+
+
 def test_silent_drive_is_asked_less_often_each_time_while_others_are_polled() -> None:
     dead, alive = job(1), job(2)
     made = schedule(dead, alive)
@@ -707,11 +719,11 @@ def test_new_drive_that_does_not_reply_gets_no_more_requests_for_a_while() -> No
 def test_few_silent_new_drives_get_a_second_request_immediately() -> None:
     """The drives may exist, because their first request or reply may have been lost."""
     lost, living = job(1), job(2)
-    for cost_ms, again in {300: {lost}, 500: set()}.items():
+    for cost_ns, again in {400 * MS: {lost}, 400 * MS + 1: set()}.items():
         made = meet(lost, living)
         take(made, 0, 100)
         made.back_off.conclude(lost.drive)
-        made.back_off.observe(1, 1, 60 * MS, late_until_ns=200 * MS, cost_ns=cost_ms * MS, has_answered=False)
+        made.back_off.observe(1, 1, 60 * MS, late_until_ns=200 * MS, cost_ns=cost_ns, has_answered=False)
         # the result of the other drive's request is not known yet
         assert lost not in {asked for asked, _ in take(made, 70, 100)}
         answer(made, living, 90)

@@ -181,6 +181,32 @@ def test_the_schedule_alternates_the_blocks_of_a_drive_with_a_least_interval() -
     assert not [gap for (sooner, _), (later, _) in pairwise(taken) if (gap := later - sooner) != 10]
 
 
+def test_a_schedule_has_no_cycle_while_a_drive_has_a_least_interval() -> None:
+    schedule: Schedule[Job] = Schedule()
+    first, second = (Job(drive=1, period_ns=None, duration_ns=10, interval_ns=1000) for _ in range(2))
+    other = Job(drive=2, period_ns=None, duration_ns=10)
+    schedule.add(first, 0)
+    schedule.add(second, 0)
+    assert schedule.cycle(0) == []
+    schedule.remove(first)
+    assert schedule.cycle(0) == []
+    schedule.add(other, 0)
+    schedule.remove(second)
+    assert schedule.cycle(0) == [other]
+
+
+def test_a_removed_job_is_not_sent_after_its_drives_least_interval() -> None:
+    schedule: Schedule[Job] = Schedule()
+    other = Job(drive=2, period_ns=None, duration_ns=10)
+    first, second = (Job(drive=1, period_ns=None, duration_ns=10, interval_ns=1000) for _ in range(2))
+    for job in (other, first, second):
+        schedule.add(job, 0)
+    assert [turn.job for turn in schedule.take(0, 0, 30, 9)] == [other, first, other]
+    schedule.remove(other)
+    schedule.remove(second)
+    assert [turn.job for turn in schedule.take(2000, 2000, 2001, 9)] == [first]
+
+
 def test_a_stop_waiting_for_its_drive_does_not_delay_another_stop(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
     monkeypatch.setattr(clock, "now_ns", lambda: round(now[0] * 1e9))
