@@ -26,7 +26,7 @@ from tables import table
 
 from multidrop import Drive, PlantError
 from multidrop.control import CommandOutcome, CommandResult
-from multidrop.control.commands import Results
+from multidrop.control.commands import MOST_STOPS, Results
 from multidrop.control.records import AuditLog
 from multidrop.gateway import commands, parts
 from multidrop.gateway.http import messages
@@ -325,12 +325,12 @@ def test_a_stop_is_sent_although_no_thread_can_be_started(gateway: Served) -> No
 
 @pytest.mark.long
 def test_many_stops_of_a_silent_drive_do_not_delay_the_stop_of_another(gateway: Served) -> None:
-    """Of the 40 stops, the gateway repeats only one, so it can send the other drive's stop immediately."""
+    """Of the 40 stops, the gateway repeats only one and joins most, so it can send the other drive's stop."""
     with ThreadPoolExecutor(40) as callers:
         gateway.start("pump-1", "pump-2")
         gateway.sims["pump-2"].deaf_until = float("inf")
         calls = [callers.submit(gateway.post, "/api/stop", {"drives": ["pump-2"]}) for _ in range(40)]
-        until(lambda: gateway.gateway.commands.stops["pump-2"] == 40)
+        until(lambda: gateway.gateway.commands.stops["pump-2"] > MOST_STOPS)
         begun = monotonic()
         assert gateway.post("/api/stop", {"drives": ["pump-1"]}).json["pump-1"]["done"] is True
         assert monotonic() - begun < 12.0  # s; the motor's ramp takes 3 s

@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -21,7 +22,10 @@ from controlled_loop import Clock
 from examples import usually
 from gateways import Served, certificate, get, served, serving, simulated_plant
 from lines import PATIENCE, until
+from starlette.requests import Request
 
+from multidrop.control import CommandResult
+from multidrop.control.commands import MOST_STOPS
 from multidrop.gateway import gateway as gateway_module
 from multidrop.gateway.http import connections, messages
 from multidrop.gateway.http import routes as web
@@ -36,7 +40,7 @@ from multidrop.gateway.http.connections import (
     Turns,
 )
 from multidrop.gateway.http.guard import MOST_HEAD
-from multidrop.gateway.http.rights import digest
+from multidrop.gateway.http.rights import Caller, Right, digest
 
 HEAD = b"POST /api/act HTTP/1.1\r\nhost: localhost\r\ncontent-type: application/json\r\n"
 SLOW = [b"", b"POST /api/act HTTP/1.1\r\nhost: loc", HEAD + b"content-length: 100\r\n\r\n{"]
@@ -246,6 +250,28 @@ def test_a_connection_whose_client_reads_no_answers_is_closed(
     clock.now += STALLED_S + 0.1
     connections.sweep()
     assert [is_ended(pair) for pair in pairs[:2]] == [True, False]
+
+
+async def test_http_stops_of_a_silent_drive_are_joined(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(web, "HEAD_S", 0.01)
+    called, silent = list[list[str]](), asyncio.Event()
+
+    async def stop(drives: list[str], caller: Caller) -> dict[str, CommandResult]:
+        called.append(drives)
+        await silent.wait()
+        return {}
+
+    async def receive() -> Any:
+        return {"type": "http.request", "body": b'{"drives": ["pump-1"]}'}
+
+    gateway: Any = SimpleNamespace(frames=None, commands=SimpleNamespace(stop=stop))
+    pages = web.Pages(gateway)
+    scope = {"type": "http", "headers": [], "caller": Caller("anna", "http", "127.0.0.1", Right.STOP)}
+    await asyncio.gather(*(pages.stop(Request(scope, receive)) for _ in range(MOST_STOPS + 5)))
+    while len(called) <= MOST_STOPS:
+        await asyncio.sleep(0.01)
+    assert called == [["pump-1"]] * (MOST_STOPS + 1)
+    silent.set()
 
 
 async def test_one_request_starts_per_event_loop_cycle_and_stops_start_first() -> None:

@@ -21,6 +21,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from multidrop import WriteForbidden
 from multidrop.control import CommandOutcome, CommandResult, read_audit
+from multidrop.control.commands import JoinedStops
 from multidrop.exposition import expose_metrics
 from multidrop.gateway.clock import iso_time, utc_ms
 from multidrop.gateway.commands import STOPPING, Admit, UnknownDrive
@@ -177,19 +178,18 @@ def newest_records(path: Path | None, before: str = "", count: int = MOST_RECORD
     return {"entries": newest[:count], "more": len(newest) > count}
 
 
-async def _answer_stop(work: Coroutine[Any, Any, R], respond: Callable[[R], Response]) -> Response:
+async def _answer_stop(stopping: asyncio.Future[R], respond: Callable[[R], Response]) -> Response:
     """Wait for a stop, and return its answer. The stop continues even if its client disconnects.
 
     If the stop takes longer than HEAD_S, the head of the answer is sent before the stop ends. So a client
     that gets no head knows that its stop was not accepted.
     """
-    task = supervisor().start("stop", work)
-    await asyncio.wait({task}, timeout=HEAD_S)
-    if task.done():
-        return respond(task.result())
+    await asyncio.wait({stopping}, timeout=HEAD_S)
+    if stopping.done():
+        return respond(stopping.result())
 
     async def body() -> AsyncIterator[bytes]:
-        yield bytes(respond(await asyncio.shield(task)).body)
+        yield bytes(respond(await asyncio.shield(stopping)).body)
 
     return StreamingResponse(body(), media_type="application/json", headers=UNBUFFERED)
 
@@ -201,6 +201,7 @@ class Pages(PageFiles):
         super().__init__()
         self._gateway = gateway
         self._exports = Exports()
+        self._stops = JoinedStops()
         self.frame = FrameRoute(gateway.frames)
 
     async def openapi(self, request: Request) -> Response:
@@ -327,7 +328,9 @@ class Pages(PageFiles):
     async def stop(self, request: Request) -> Response:
         drives, given_id = await drives_to_stop(request)
         caller = caller_of(request).stopping(given_id)
-        return await _answer_stop(self._gateway.commands.stop(drives, caller), partial(_answer_all, caller))
+        work = partial(self._gateway.commands.stop, drives, caller)
+        stopping = self._begin_stop(("stop", drives and tuple(drives)), work)
+        return await _answer_stop(stopping, partial(_answer_all, caller))
 
     async def stop_fleet(self, request: Request) -> Response:
         """Stop all drives of the fleet. This needs a commander's key: `commander` in `[serve.fleet]`."""
@@ -336,7 +339,7 @@ class Pages(PageFiles):
             raise Denied(404, "this gateway cannot stop the fleet; add commander to [serve.fleet]")
         caller = caller_of(request)
         _log.warning("stop of the whole fleet, asked for by %s", caller.by)
-        return await _answer_stop(part.stop(caller.by), _answer_fleet)
+        return await _answer_stop(self._begin_stop("fleet", partial(part.stop, caller.by)), _answer_fleet)
 
     async def write(self, request: Request) -> Response:
         body = await body_of(request)
@@ -360,10 +363,14 @@ class Pages(PageFiles):
         sender = caller_of(request)
         caller = sender.stopping(body.get("id")) if verb in STOPPING else commander_in(request, body)
         admit = self._admission(drive, (verb, repr(options), sender), body)
-        acting = self._gateway.commands.act(drive, verb, options, caller, admit)
+        acting = partial(self._gateway.commands.act, drive, verb, options, caller, admit)
         if verb in STOPPING:
-            return await _answer_stop(acting, partial(_answer, caller))
-        return _answer(caller, await acting)
+            return await _answer_stop(self._begin_stop((verb, drive), acting), partial(_answer, caller))
+        return _answer(caller, await acting())
+
+    def _begin_stop(self, what: object, work: Callable[[], Coroutine[Any, Any, R]]) -> asyncio.Future[R]:
+        """Start a stop; `what` says which drives it stops, and how."""
+        return self._stops.begin(what, lambda: supervisor().start("stop", work()))
 
     def _admission(self, drive: str, command: object, body: Mapping[str, Any]) -> Admit:
         """Return a function that admits a command only if its sender has seen a recent frame of values."""
