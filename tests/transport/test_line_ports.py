@@ -211,6 +211,10 @@ def os_words_of_an_unknown_zone() -> str:
         ("/dev/null", "it is not a serial port"),
         ("socket://127.0.0.1:{closed}", "nothing listens there"),
         ("rfc2217://127.0.0.1:{closed}", "nothing listens there"),
+        (
+            "127.0.0.1:502",
+            "for Modbus TCP write tcp://127.0.0.1:502, for RTU over TCP socket://127.0.0.1:502",
+        ),
         ("socket://127.0.0.1", "it needs a host and a port number, such as socket://10.0.0.7:4001"),
         ("rfc2217://:4001", "it needs a host and a port number, such as rfc2217://10.0.0.7:4001"),
         ("socket://127.0.0.1:99999", "Port out of range 0-65535"),
@@ -234,7 +238,9 @@ def test_opening_an_invalid_port_raises_a_one_sentence_error(tmp_path: Path, por
     assert str(caught.value) == f"{port}: {reason}"
     assert (caught.value.port, caught.value.reason) == (port, reason)
     assert isinstance(caught.value, OSError)
-    is_mistaken = any(word in reason for word in ("needs a host", "out of range", "there is no sokcet"))
+    is_mistaken = any(
+        word in reason for word in ("needs a host", "out of range", "there is no sokcet", "write tcp:")
+    )
     assert isinstance(caught.value, ValueError) == is_mistaken
 
 

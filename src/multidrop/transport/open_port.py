@@ -122,6 +122,8 @@ def why_lost(port: str, error: int, received: bytes = b"") -> str:
     return f"the received bytes are not Modbus TCP: {shown}{mixed_up(port, received)}"
 
 
+_HOST_AND_PORT = re.compile(r"[\w.-]+:\d+")  # an address without a scheme, such as 10.0.0.7:502
+
 # pyserial's URLs, allowed only without options: spy://DEVICE?file=PATH would empty a file
 _FOR_PROGRAMS = ("loop", "spy")
 
@@ -143,6 +145,8 @@ def unopened(port: str) -> serial.Serial:
     known = SCHEMES if "?" in rest else (*SCHEMES, *_FOR_PROGRAMS)
     if is_url and scheme.lower() not in known:
         raise NoSuchPort(port, f"there is no {scheme}://; a URL is such as {URLS}")
+    if not is_url and _HOST_AND_PORT.fullmatch(port) and not Path(port).exists():
+        raise NoSuchPort(port, f"for Modbus TCP write tcp://{port}, for RTU over TCP socket://{port}")
     if url.scheme == "rfc2217":
         found = RFC2217Port()
         found.port = port
