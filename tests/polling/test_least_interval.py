@@ -188,6 +188,7 @@ def test_a_schedule_has_no_cycle_while_a_drive_has_a_least_interval() -> None:
     schedule.add(first, 0)
     schedule.add(second, 0)
     assert schedule.cycle(0) == []
+    assert [turn.job for turn in schedule.take(0, 0, 1, 9)] == [first]
     schedule.remove(first)
     assert schedule.cycle(0) == []
     schedule.add(other, 0)
@@ -195,16 +196,17 @@ def test_a_schedule_has_no_cycle_while_a_drive_has_a_least_interval() -> None:
     assert schedule.cycle(0) == [other]
 
 
-def test_a_removed_job_is_not_sent_after_its_drives_least_interval() -> None:
+def test_after_a_least_interval_only_jobs_that_were_not_removed_are_sent() -> None:
     schedule: Schedule[Job] = Schedule()
     other = Job(drive=2, period_ns=None, duration_ns=10)
     first, second = (Job(drive=1, period_ns=None, duration_ns=10, interval_ns=1000) for _ in range(2))
     for job in (other, first, second):
         schedule.add(job, 0)
     assert [turn.job for turn in schedule.take(0, 0, 30, 9)] == [other, first, other]
-    schedule.remove(other)
     schedule.remove(second)
     assert [turn.job for turn in schedule.take(2000, 2000, 2001, 9)] == [first]
+    schedule.remove(other)
+    assert [turn.job for turn in schedule.take(2010, 2010, 3011, 9)] == [first]
 
 
 def test_a_stop_waiting_for_its_drive_does_not_delay_another_stop(monkeypatch: pytest.MonkeyPatch) -> None:
