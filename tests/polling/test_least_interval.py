@@ -207,6 +207,8 @@ def test_after_a_least_interval_only_jobs_that_were_not_removed_are_sent() -> No
     assert [turn.job for turn in schedule.take(2000, 2000, 2001, 9)] == [first]
     schedule.remove(other)
     assert [turn.job for turn in schedule.take(2010, 2010, 3011, 9)] == [first]
+    schedule.back_off.observe(1, 1, 3020, late_until_ns=9000, cost_ns=0)
+    assert schedule.take(4020, 4020, 5000, 9) == []  # the interval ends now, but the drive is silent
 
 
 def test_a_stop_waiting_for_its_drive_does_not_delay_another_stop(monkeypatch: pytest.MonkeyPatch) -> None:
