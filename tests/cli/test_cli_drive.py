@@ -398,8 +398,10 @@ def test_state_is_printed_in_words_and_as_json(run: Run, port: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("words", [(9,), (1, "--baudrate", 19200)], ids=["no drive", "wrong baud rate"])
 def test_a_silent_drive_is_reported_with_advice(run: Run, port: str, words: tuple[object, ...]) -> None:
-    sentence = "does not answer: check its address, baud rate, format, wiring, and that it has power"
-    assert run("read", port, TOY, *words, "status") == (1, "", f"multidrop: toy@{words[0]} {sentence}\n")
+    used = f"at address {words[0]} with {19200 if len(words) > 1 else 9600} 8N1"
+    advice = "check its address, baud rate, format, wiring, and that it has power"
+    sentence = f"multidrop: toy@{words[0]} does not answer {used}: {advice}\n"
+    assert run("read", port, TOY, *words, "status") == (1, "", sentence)
 
 
 def test_a_damaged_reply_is_reported_in_one_sentence(run: Run, toy: SimulatedDrive) -> None:

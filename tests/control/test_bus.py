@@ -345,7 +345,9 @@ def test_a_read_of_a_silent_drive_is_retried_a_few_times() -> None:
         with pytest.raises(NoReply) as caught:
             ours.read(ours.speed)
         until(lambda: rig.counters.requests >= READ_ATTEMPTS)
-    assert str(caught.value).startswith("pump does not answer: check its address, ")
+    assert str(caught.value).startswith(
+        "pump does not answer at address 1 with 9600 8N1: check its address, "
+    )
     assert caught.value.drive == "pump"
     assert isinstance(caught.value, TimeoutError)
     assert rig.counters.requests == READ_ATTEMPTS

@@ -55,7 +55,8 @@ def no_reply(drive: Drive, completion: Completion) -> NoReply:
     line = drive.bus.line
     is_stalled = line.is_stalled or completion.result == Failure.STALLED
     hint = f"; but the port is {STALLED}" if is_stalled else silence_hint(line.port)
-    return NoReply(drive.name, hint=hint)
+    where = "" if drive.framing is Framing.TCP else f" at address {drive.address} with {drive.settings}"
+    return NoReply(drive.name, where, hint=hint)
 
 
 def check_master(drive: Drive, completion: Completion) -> None:
