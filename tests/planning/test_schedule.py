@@ -733,6 +733,16 @@ def test_few_silent_new_drives_get_a_second_request_immediately() -> None:
         assert lost not in {asked for asked, _ in take(made, 230, 20)}
 
 
+def test_drive_whose_pause_ends_first_is_tried_when_another_answers_again() -> None:
+    made = schedule(*(jobs := [job(drive) for drive in range(3)]))
+    fail(made, 0, 2, 0, late_until_ms=300)
+    fail(made, 1, 2, 100)
+    fail(made, 2, 2, 0)
+    answer(made, jobs[2], 200)
+    assert {asked for asked, _ in take(made, 200, 50)} == {jobs[2]}  # a late reply may come until 300 ms
+    assert {asked for asked, _ in take(made, 300, 50)} == {jobs[0], jobs[2]}
+
+
 def test_exactly_one_other_silent_drive_is_tried_when_one_answers_again() -> None:
     made = schedule(*(jobs := [job(drive) for drive in range(4)]))
     for failures, drive in itertools.product((2, 3), (0, 1, 2)):
