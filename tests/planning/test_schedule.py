@@ -445,6 +445,20 @@ def test_replacement_of_a_poll_keeps_its_turn_and_its_next_due_time() -> None:
     assert set(made.jobs) == {jobs[1], both, one, other, slower}
 
 
+def test_a_new_order_of_drives_starts_a_new_round() -> None:
+    made = schedule(*(jobs := [job(drive) for drive in range(3)]))
+    assert take(made, 0, 1) == [(jobs[0], 0)]
+    made.put_in_order([2, 1, 0])
+    assert [asked for asked, _ in take(made, 100, 15)] == [jobs[2], jobs[1], jobs[0]]
+
+
+def test_replacement_of_a_poll_without_a_period_takes_its_turn() -> None:
+    made = schedule(*(jobs := [job(drive) for drive in range(3)]))
+    assert take(made, 0, 1) == [(jobs[0], 0)]
+    made.replace(jobs[1:2], [new := job(1)], 0)
+    assert [asked for asked, _ in take(made, 100, 15)] == [new, jobs[2], jobs[0]]
+
+
 def test_cycle_returns_polls_only_if_all_drives_answer_and_none_has_a_period() -> None:
     made = schedule(one := job(1), two := job(2))
     assert made.cycle(0) == [one, two]
