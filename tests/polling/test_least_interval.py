@@ -211,6 +211,16 @@ def test_after_a_least_interval_only_jobs_that_were_not_removed_are_sent() -> No
     assert schedule.take(4020, 4020, 5000, 9) == []  # the interval ends now, but the drive is silent
 
 
+def test_the_next_job_is_planned_for_the_first_end_of_a_least_interval() -> None:
+    schedule: Schedule[Job] = Schedule()
+    slow, fast = (
+        Job(drive=drive, period_ns=None, duration_ns=10, interval_ns=1000 // drive) for drive in (1, 2)
+    )
+    schedule.add(slow, 0)
+    schedule.add(fast, 0)
+    assert [turn.job for turn in schedule.take(0, 0, 700, 9)] == [slow, fast, fast]
+
+
 def test_a_stop_waiting_for_its_drive_does_not_delay_another_stop(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
     monkeypatch.setattr(clock, "now_ns", lambda: round(now[0] * 1e9))
