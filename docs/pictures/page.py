@@ -22,18 +22,21 @@ SHOWN_MS = 5_000  # ms until the page has drawn its plots
 
 
 def main(out: Path = HERE / "page.png", width: int = 1440, height: int = 900, place: str = "") -> None:
-    with subprocess.Popen(COMMAND, stdout=subprocess.PIPE, text=True) as demo, sync_playwright() as player:
-        assert demo.stdout is not None
-        url = demo.stdout.readline().split()[1]
-        time.sleep(MINUTE_S)
-        chromium = shutil.which("chromium") or shutil.which("google-chrome")
-        browser = player.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
-        page = browser.new_page(viewport={"width": width, "height": height}, color_scheme="light")
-        page.goto(url + place)
-        page.wait_for_timeout(SHOWN_MS)
-        page.screenshot(path=out)
-        browser.close()
-        demo.terminate()
+    names = ("chromium", "google-chrome", "chromium-headless-shell")
+    chromium = next(filter(None, map(shutil.which, names)), None)
+    with sync_playwright() as player, subprocess.Popen(COMMAND, stdout=subprocess.PIPE, text=True) as demo:
+        try:
+            assert demo.stdout is not None
+            url = demo.stdout.readline().split()[1]
+            time.sleep(MINUTE_S)
+            browser = player.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+            page = browser.new_page(viewport={"width": width, "height": height}, color_scheme="light")
+            page.goto(url + place)
+            page.wait_for_timeout(SHOWN_MS)
+            page.screenshot(path=out)
+            browser.close()
+        finally:
+            demo.terminate()
 
 
 if __name__ == "__main__":
