@@ -766,3 +766,41 @@ def test_exactly_one_other_silent_drive_is_tried_when_one_answers_again() -> Non
     assert {asked for asked, _ in take(made, 1100, 400)} == {jobs[0], jobs[2], jobs[3]}
     made.back_off.observe(0, 4, 1500 * MS, late_until_ns=0, cost_ns=300 * MS)
     assert {asked for asked, _ in take(made, 1500, 1000)} == {jobs[2], jobs[3]}
+
+
+# ---- turns that were not carried out ----
+
+
+def plans(made: Schedule[Job]) -> list[list[tuple[Job, int, int | None]]]:
+    """Return the turns of two plans: until 12 ms, and from there until 60 ms."""
+    return [[*made.take(at * MS, at * MS, until * MS, 9)] for at, until in ((0, 12), (12, 60))]
+
+
+def test_turns_put_back_are_planned_again_with_their_slots_and_in_their_order() -> None:
+    made = schedule(job(1, 40), job(2), job(3, 60), job(4))
+    before = plans(made)
+    assert [len(plan) for plan in before] == [3, 9]
+    made.put_back([turn for plan in before for turn in plan])
+    assert plans(made) == before
+    made.put_back(before[1])
+    assert made.take(12 * MS, 12 * MS, 60 * MS, 9) == before[1]
+    assert [each.skipped for each in made.jobs] == [0, 0, 0, 0]
+
+
+def test_a_turn_of_a_removed_poll_is_not_planned_again() -> None:
+    made = schedule(timed := job(1, 40), job(2))
+    turns = made.take(0, 0, 4 * MS, 1)
+    assert [turn.job for turn in turns] == [timed]
+    made.remove(timed)
+    made.put_back(turns)
+    assert timed not in {each for each, _ in take(made, 0, 100)}
+
+
+def test_a_new_drive_is_asked_again_if_its_first_request_was_put_back() -> None:
+    made = schedule(job(1, 40))
+    made.back_off.meet(1)
+    turns = made.take(0, 0, 4 * MS, 9)
+    assert len(turns) == 1
+    assert take(made, 50, 4) == []  # waits for the result of the first request
+    made.put_back(turns)
+    assert [due for _, due in take(made, 50, 4)] == [40]
