@@ -68,6 +68,7 @@ def test_apply_writes_only_after_confirmation(run: Run, drive: tuple[object, ...
     assert "Write 1 parameter to" in err
 
 
+@pytest.mark.long
 def test_a_refused_write_names_its_option(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))

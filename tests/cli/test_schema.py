@@ -235,6 +235,7 @@ def invalid_plants() -> list[str]:
     return [text for text in texts if is_toml(text)]
 
 
+@pytest.mark.long
 def test_schema_accepts_the_valid_plant_files() -> None:
     valid = valid_plants()
     assert len(valid) > 20
@@ -350,6 +351,7 @@ def valid_families() -> list[str]:
     return [*(path.read_text("utf-8") for path in shipped), *documented("[family]"), FAMILIES.METER]
 
 
+@pytest.mark.long
 def test_schema_accepts_the_valid_family_files() -> None:
     valid = valid_families()
     assert len(valid) > 20

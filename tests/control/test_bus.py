@@ -106,6 +106,7 @@ REQUESTS = {  # requests for all readings, from the manuals' register maps and l
 }
 
 
+@pytest.mark.long
 @patient
 @pytest.mark.parametrize("family", REQUESTS)
 def test_all_readings_take_as_few_requests_as_the_family_allows(family: type[Drive]) -> None:

@@ -570,6 +570,7 @@ def test_a_poller_restores_the_handlers_that_its_bus_replaced(caught: list[int],
     assert signal.getsignal(signal.SIGTERM) == before
 
 
+@pytest.mark.long
 def test_sigterm_stops_drives_before_a_handler_installed_between_pollers_runs(caught: list[int]) -> None:
     """The program's own SIGTERM handler, installed between two pollers, runs once the motor has stopped."""
     drive = InvtCHE(1, maximum_frequency=50, name="pump")

@@ -107,6 +107,7 @@ def test_a_silent_drive_is_identified_before_a_write(model: str, monkeypatch: py
         assert looks == ["look"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("model", MAKE)
 @pytest.mark.usefixtures("_patient")
 @pytest.mark.parametrize("pause", ["idle", "asleep", "read since"])
@@ -130,6 +131,7 @@ def test_a_drive_is_identified_after_10_s(model: str, pause: str, monkeypatch: p
         assert looks == ["look"]
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("_turns_awaited")
 @pytest.mark.parametrize("model", MAKE)
 @pytest.mark.parametrize("is_silent", [False, pytest.param(True, marks=pytest.mark.slow)])

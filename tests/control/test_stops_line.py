@@ -78,6 +78,7 @@ def in_thread(act: Callable[[], object]) -> tuple[threading.Thread, list[BaseExc
     return thread, failures
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("what", "ending"), in_turn(["start", "write", "raw"], ["close", "detach"]))
 def test_a_write_in_flight_is_unconfirmed_when_another_thread_closes(
     monkeypatch: pytest.MonkeyPatch, ending: str, what: str
@@ -111,6 +112,7 @@ def test_a_write_in_flight_is_unconfirmed_when_another_thread_closes(
         assert len(received.writes) == begun + 1
 
 
+@pytest.mark.long
 @every_family
 def test_a_stop_of_another_thread_cancels_a_start_that_waits_for_a_reply(model: str) -> None:
     """The start's read is not answered until the stop was answered."""
@@ -257,7 +259,7 @@ def test_closing_a_poller_with_a_lost_port_stops_its_motors(
 ) -> None:
     """The motors are stopped whether the poller or the stop reopens the port."""
     if opener == "the stop":
-        monkeypatch.setattr(Reopening, "_attempt", lambda reopening: None)
+        monkeypatch.setattr(Reopening, "_attempt", lambda failing: failing._bus.note_reopening(False))
     pulled = Pulled(tmp_path / "port")
     drive: Any = pulled.drive
     with ExitStack() as stack:
@@ -294,6 +296,7 @@ def test_other_commands_are_not_sent_while_a_stop_is_repeated() -> None:
         assert received.starts == []
 
 
+@pytest.mark.long
 def test_an_unsent_stop_is_not_recorded_as_sent(tmp_path: Path) -> None:
     """The stop is repeated while it waits for the poller to reopen the port."""
     audit = tmp_path / "audit.jsonl"

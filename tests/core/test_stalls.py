@@ -175,6 +175,7 @@ def test_a_stop_does_not_wait_for_a_read_that_waits_for_a_stalled_adapter(ends: 
     assert taken(ends[1])[0] == frame(OTHER)
 
 
+@pytest.mark.long
 def test_a_reply_after_a_stall_is_not_taken_for_the_reply_to_the_next_read(ends: Ends, port: Port) -> None:
     """The device has no proofs, and the stall is longer than the window of late replies."""
     adapter, peer = ends[1], Peer(least_timeout=0.2, most_timeout=0.2)
@@ -273,6 +274,7 @@ def test_a_count_of_unsent_bytes_that_stays_above_0_is_ignored(ends: Ends, port:
     assert device.heard == [frame(request) for request in requests]
 
 
+@pytest.mark.long
 def test_a_wrong_count_of_unsent_bytes_does_not_delay_other_drives(ends: Ends, port: Port) -> None:
     requests = [READ, OTHER, SILENT, READ, SILENT]
     with Device(ends[1], len(requests), miscounted=0):

@@ -106,6 +106,7 @@ def gateway(
     return run
 
 
+@pytest.mark.long
 def test_a_gateway_runs_exactly_the_listed_tasks_and_threads(gateway: Any) -> None:
     before = {*threading.enumerate()}
 
@@ -370,6 +371,7 @@ async def _begun(times: int) -> asyncio.Task[str]:
     return task
 
 
+@pytest.mark.long
 async def test_end_tasks_cancels_a_task_repeatedly_until_it_has_ended() -> None:
     tasks = [await _begun(times) for times in (0, 1, 3)]
     found = await asyncio.wait_for(end_tasks(*tasks), PATIENCE_S)

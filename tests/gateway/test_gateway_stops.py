@@ -53,6 +53,7 @@ def calling(gateway: Served) -> socket.socket:
     return socket.create_connection(("127.0.0.1", gateway.gateway.port), PATIENCE)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("path", "body"), [("/api/stop", {"drives": None}), ("/api/act", {"drive": "pump-1", "verb": "coast"})]
 )

@@ -149,6 +149,7 @@ def test_a_hanging_history_query_is_reported(tmp_path: Path, monkeypatch: pytest
         until(lambda: health(gateway)["status"] == "ok")
 
 
+@pytest.mark.long
 def test_a_disk_that_hangs_at_history_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     go_on = threading.Event()
     with served(tmp_path, SERVE + HISTORY) as gateway:
@@ -267,6 +268,7 @@ def test_a_hanging_ledger_and_audit_log_are_reported(tmp_path: Path, monkeypatch
         until(lambda: health(gateway)["status"] == "ok")
 
 
+@pytest.mark.long
 def test_hanging_page_files_delay_no_other_request(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     go_on, read = threading.Event(), Path.read_bytes
 

@@ -267,6 +267,7 @@ def test_a_token_removed_from_the_file_is_invalid_after_a_reload(tmp_path: Path)
             assert begun_ns <= read_ns <= boottime_ns()
 
 
+@pytest.mark.long
 def test_values_before_a_reload_are_not_shown_after(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """After the reload, the name may mean another drive, and this drive may be silent."""
     monkeypatch.setattr(drive_reads, "PAUSE_S", 0.0)

@@ -83,6 +83,7 @@ def dead(gateway: Served) -> Any:
     return answer.json["dead"]
 
 
+@pytest.mark.long
 def test_a_gateway_has_exactly_the_expected_tasks_and_threads(gateway: Served) -> None:
     assert in_loop(gateway.loop, lambda found: set(found.kept)) == TASKS
     assert gateway.get("/health").json["dead"] == {}
@@ -111,6 +112,7 @@ def test_without_a_poller_stops_are_still_sent(gateway: Served, monkeypatch: pyt
     until(lambda: dead(gateway) == {})
 
 
+@pytest.mark.long
 def test_a_line_whose_polling_fails_is_reported(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     failures = {"hall": "ZeroDivisionError: a bug in a user's class"}
     monkeypatch.setattr(Poller, "line_failures", property(lambda poller: failures), raising=False)
@@ -119,6 +121,7 @@ def test_a_line_whose_polling_fails_is_reported(gateway: Served, monkeypatch: py
     until(lambda: f"line hall: polling fails: {failures['hall']}" in gateway.frame()["troubles"])
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 def test_a_dead_history_thread_makes_health_fail(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     part: Any = gateway.gateway.feeds["history"]
@@ -141,6 +144,7 @@ def test_a_thread_of_the_broker_connection_that_ends_makes_health_fail(gateway: 
     until(lambda: dead(gateway) == {"mqtt": "RuntimeError: the thread of the broker's connection has ended"})
 
 
+@pytest.mark.long
 def test_a_watched_thread_that_ends_makes_health_fail(gateway: Served) -> None:
     over = threading.Event()
     in_loop(gateway.loop, lambda found: found.watch("log", lambda: not over.is_set()))

@@ -104,6 +104,7 @@ def test_an_invalid_comment_is_refused(port: str, text: str) -> None:
         poller.mark(text)
 
 
+@pytest.mark.long
 @patient
 def test_channel_totals_continue_exactly_after_a_restart(port: str, tmp_path: Path) -> None:
     made = replace(plant(line(port, pump(CHARGE))), totals=tmp_path / "totals.json")
@@ -133,6 +134,7 @@ def test_adopt_continues_channel_totals_and_drops_removed_channels(port: str) ->
     assert of(rows[-5:], "double") == []
 
 
+@pytest.mark.long
 @patient
 def test_no_channel_combines_values_of_two_drives_with_the_same_name() -> None:
     change = Channel("change", "derivative(output_current)", "A/s")
@@ -193,6 +195,7 @@ def test_no_channel_is_computed_of_an_unpolled_register(port: str, caplog: pytes
     assert 'drive "pump-2", channel "other"' in caplog.text
 
 
+@pytest.mark.long
 @patient
 def test_totals_start_at_0_if_their_file_is_damaged(port: str, tmp_path: Path) -> None:
     for content in ("", "[", "[]", '{"pump-1.charge": {"totals": [[1e999]]}}'):

@@ -209,6 +209,7 @@ def poller() -> Iterator[Poller]:
             yield made
 
 
+@pytest.mark.long
 def test_a_for_loop_gets_batches_until_the_poller_is_closed(poller: Poller) -> None:
     rows = 0
     for batch in poller:

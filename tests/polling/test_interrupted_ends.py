@@ -87,6 +87,7 @@ NIGHTLY = pytest.mark.nightly
 STEPS = [*usually(STRIDE, 7), pytest.param(1, marks=NIGHTLY)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("end", "step"),
     [

@@ -354,6 +354,7 @@ def test_a_port_handled_by_pyserial_is_refused_and_changes_nothing(mastership: M
         Rows(poller).settle("pump")
 
 
+@pytest.mark.long
 def test_a_new_mastership_listens_again_before_its_first_request(mastership: Mastership) -> None:
     hold(mastership)
     wire = Wire([simulated(QuickToy(1))], unpaced=True)

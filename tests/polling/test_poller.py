@@ -377,6 +377,7 @@ def test_replies_at_9600_baud_are_read_without_early_requests(pump: SimulatedDri
     polling.check("ok")
 
 
+@pytest.mark.long
 def test_a_port_lost_during_a_reply_gives_misses_with_that_status() -> None:
     master, slave = os.openpty()
     with Polling(line(os.ttyname(slave), polled(drive(), READINGS))) as polling:
@@ -685,6 +686,7 @@ def test_a_recording_poller_of_31_drives_uses_at_most_30_mb() -> None:
     assert 5.0 < int(ran.stdout) / 1024 <= MOST_MB
 
 
+@pytest.mark.long
 def test_closing_waits_for_the_stalled_adapters_of_all_lines_together(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -139,6 +139,7 @@ def test_a_stop_of_a_failed_poller_reopens_its_port(hall: Plant, monkeypatch: py
         hall.poller.close()
 
 
+@pytest.mark.long
 def test_a_stop_reopens_a_port_between_two_attempts_of_the_poller(
     hall: Plant, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -149,6 +150,7 @@ def test_a_stop_reopens_a_port_between_two_attempts_of_the_poller(
     hall.stop()
 
 
+@pytest.mark.long
 def test_a_port_that_a_stop_has_reopened_is_not_dropped_as_lost(
     hall: Plant, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -215,6 +217,7 @@ class Scattered(Drive):
     deadly = reading(DEADLY, table=HOLDING)
 
 
+@pytest.mark.long
 @table("every", [None, 0.1])
 @table("most", [1, 2, 3])
 def test_every_register_is_read_although_the_server_closes_connections_early(
@@ -256,6 +259,7 @@ def test_a_server_that_closes_idle_connections_costs_no_value() -> None:
     assert sum(row.status != "ok" for row in rows) <= late_closes
 
 
+@pytest.mark.long
 def test_values_of_a_server_that_closes_each_connection_at_once_are_misses() -> None:
     """Many devices close a new connection at once if they already serve as many clients as they can."""
     with server(lambda nth, address: False, idle_s=0.0) as port:

@@ -327,6 +327,7 @@ dwell = "2 s"
 """
 
 
+@pytest.mark.long
 def test_no_start_is_sent_after_a_suspension_between_two_commands_of_a_step(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

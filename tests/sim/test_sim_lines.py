@@ -258,6 +258,7 @@ class IllDrive(EncodedDrive):
         raise Ill("of this drive")
 
 
+@pytest.mark.long
 def test_simulated_drive_that_fails_does_not_disturb_other_lines(caplog: pytest.LogCaptureFixture) -> None:
     wires = [Wire([drive], unpaced=True) for drive in (IllDrive(Toy(1)), EncodedDrive(Toy(1)))]
     simulator = Simulator(wires)

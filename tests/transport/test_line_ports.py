@@ -60,6 +60,7 @@ def read_at_every_baud_rate(family: type[Drive]) -> None:
             assert attached.read(first) == drive[first.name]
 
 
+@pytest.mark.long
 def test_every_documented_baud_rate_can_be_read() -> None:
     """The library knows this value in advance, so it recognises a late reply to another read."""
     with ThreadPoolExecutor(len(MODELS)) as pool:

@@ -506,6 +506,7 @@ def test_an_offer_does_not_change_the_known_setpoint() -> None:
     assert drive.commanded == 40.0
 
 
+@pytest.mark.long
 async def test_a_joined_stop_cancels_offered_commands_immediately(
     desk: Desks, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -157,6 +157,7 @@ async def test_requests_without_an_answer_and_without_a_receiver_are_distinguish
     await client.close()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("deaf_to", "is_told"), [(0, True), (1, True), (4, True), (5, False)])
 async def test_a_read_that_is_lost_on_a_cut_off_server_is_repeated(
     one: Cluster, monkeypatch: pytest.MonkeyPatch, deaf_to: int, is_told: bool

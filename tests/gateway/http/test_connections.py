@@ -105,6 +105,7 @@ def connected(gateway: Served) -> Iterator[socket.socket]:
         yield client
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("sent", "begin"), [(SLOW[1], b""), (SLOW[2], b"HTTP/1.1 408 ")])
 def test_an_unfinished_request_ends_its_connection(
     gateway: Served, monkeypatch: pytest.MonkeyPatch, sent: bytes, begin: bytes
@@ -252,6 +253,7 @@ def test_a_connection_whose_client_reads_no_answers_is_closed(
     assert [is_ended(pair) for pair in pairs[:2]] == [True, False]
 
 
+@pytest.mark.long
 async def test_http_stops_of_a_silent_drive_are_joined(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(web, "HEAD_S", 0.01)
     called, silent = list[list[str]](), asyncio.Event()

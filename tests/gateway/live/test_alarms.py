@@ -359,6 +359,7 @@ def test_unwritable_alarm_file_is_reported_in_health(tmp_path: Path) -> None:
         assert any("alarms are not kept" in one for one in gateway.frame()["troubles"])
 
 
+@pytest.mark.long
 def test_a_lost_port_raises_one_alarm_for_its_line(tmp_path: Path) -> None:
     (tmp_path / "plant.toml").write_text(plant_text(str(tmp_path / "none"), ["pump-1", "pump-2"]))
     plant = Plant.load(tmp_path / "plant.toml")

@@ -108,6 +108,7 @@ def test_a_page_frame_has_the_age_of_each_value(gateway: Served) -> None:
     assert "revision" not in following  # a frame of changes has no revision if the plant has not changed
 
 
+@pytest.mark.long
 def test_a_newly_opened_web_page_gets_the_values_of_the_last_minute(gateway: Served) -> None:
     began_ms, values = time.time() * 1e3, set[float]()
 

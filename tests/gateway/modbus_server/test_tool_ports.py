@@ -187,6 +187,7 @@ def test_only_the_newest_of_several_pending_requests_is_answered(rig: Rig, tool:
     assert receive(tool, 1, QUIET) == b""
 
 
+@pytest.mark.long
 def test_a_modbus_tool_gets_no_reply_after_the_timeout_of_its_port(tmp_path: Path) -> None:
     with serving(tmp_path, timeout=0.05) as rig, opened(str(rig.link)) as tool:
         rig.ports.lines["hall"].share.share = 100.0  # no pauses
@@ -202,6 +203,7 @@ def test_a_modbus_tool_gets_no_reply_after_the_timeout_of_its_port(tmp_path: Pat
         assert receive(tool, 1, QUIET) == b""
 
 
+@pytest.mark.long
 def test_a_modbus_tool_that_exceeds_its_share_of_line_time_gets_exception_06(tmp_path: Path) -> None:
     with serving(tmp_path, timeout=1.0) as rig, opened(str(rig.link)) as tool:
         rig.ports.lines["hall"].share.share = 0.01

@@ -386,6 +386,7 @@ class Cyclic:
         self.own = self
 
 
+@pytest.mark.long
 async def test_memory_of_removed_drives_is_freed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     async def remove(nodes: PlantNodes, name: str) -> None:
         del nodes._drives[name]
