@@ -16,7 +16,9 @@ WAITS_BY_EPOLL = pytest.mark.skipif(sys.platform != "linux", reason="others wait
 
 def core_without(*replaced: str) -> list[str]:
     """Return the names of the core's C files, without those that the test program replaces."""
-    return [path.stem for path in (ROOT / "csrc").glob("*.c") if path.stem not in replaced]
+    csrc = ROOT / "csrc"
+    files = [*csrc.glob("*.c"), *csrc.glob("system/*.c")]
+    return [str(path.relative_to(csrc).with_suffix("")) for path in files if path.stem not in replaced]
 
 
 @pytest.fixture
@@ -77,7 +79,7 @@ def test_an_exchange_of_a_steady_drive_reads_the_port_once(build: Callable[..., 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="others have no RS-485 mode")
 def test_a_transceiver_sends_until_the_last_bit_has_left(build: Callable[..., None]) -> None:
-    build("test_rs485", "rs485")
+    build("test_rs485", "system/rs485")
 
 
 @pytest.mark.slow
@@ -88,13 +90,13 @@ def test_a_command_that_waits_too_long_for_rts_is_cancelled(build: Callable[...,
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the driver is Linux's")
 def test_a_baud_rate_without_an_integer_divisor_is_refused(build: Callable[..., None]) -> None:
-    build("test_divisors", "serial")
+    build("test_divisors", "system/serial")
 
 
 @WAITS_BY_EPOLL
 @pytest.mark.parametrize("program", ["test_waiter", "test_waiter_refused"])
 def test_waits_are_exact_to_the_nanosecond(build: Callable[..., None], program: str) -> None:
-    build(program, "waiter")
+    build(program, "system/waiter")
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="masterships are Linux's")
@@ -104,4 +106,4 @@ def test_the_mastership_deadline_is_checked_before_each_write(build: Callable[..
 
 @pytest.mark.skipif(sys.platform != "linux", reason="realtime scheduling is limited by Linux's timers")
 def test_realtime_scheduling_ends_before_it_starves_the_computer(build: Callable[..., None]) -> None:
-    build("test_realtime", "clock")
+    build("test_realtime", "system/clock")

@@ -16,7 +16,7 @@ from harness import HERE, command
 from kills import BoundProcess
 from lines import PATIENCE
 from mutation.edits import mutants
-from mutation.trials import core_names
+from mutation.trials import core_files
 from peers import CC, SANITIZERS, STRICT, require_module
 from readers import READERS, read
 from tables import table
@@ -243,8 +243,8 @@ def test_the_mutants_listed_in_explained_toml_exist() -> None:
 
 @pytest.mark.long
 def test_mutation_trials_compile_existing_files() -> None:
-    assert all((ROOT / "csrc" / f"{name}.c").exists() for name in core_names(ROOT))
-    assert {"frame", "waiter", "wakeup"} <= {*core_names(ROOT)}
+    assert all((ROOT / "csrc" / name).exists() for name in core_files(ROOT))
+    assert {"frame.c", "system/waiter.c", "system/wakeup.c"} <= {*core_files(ROOT)}
 
 
 # ---- processes of tests ----

@@ -275,7 +275,7 @@ def calls(code: dict[str, str]) -> dict[str, set[str]]:
 
 def core() -> dict[str, str]:
     """Return the text of each C file of the core by name, without comments."""
-    found = sorted((ROOT / "csrc").glob("*.c"))
+    found = [*(ROOT / "csrc").glob("*.c"), *(ROOT / "csrc" / "system").glob("*.c")]
     return {path.stem: re.sub(r"/\*.*?\*/", "", path.read_text("utf-8"), flags=re.DOTALL) for path in found}
 
 
@@ -364,7 +364,8 @@ def test_every_file_has_a_row_on_the_architecture_page() -> None:
     """Check that a row names each file, the folder in which it is, or a pattern that matches it."""
     rows = [line.split("|")[1] for line in ARCHITECTURE.read_text("utf-8").splitlines() if line[:1] == "|"]
     named = {name.rstrip("/") for row in rows for name in re.findall(r"`([^`]+)`", row)}
-    places = [*PACKAGE.iterdir(), *(ROOT / "csrc").glob("*.c"), ROOT / "csrc" / "windows"]
+    csrc = ROOT / "csrc"
+    places = [*PACKAGE.iterdir(), *csrc.glob("*.c"), *csrc.glob("system/*.c"), csrc / "windows"]
     rooms = {path.name for path in places if path.name[0] != "_" and path.suffix in ("", ".py", ".c")}
     assert {room for room in rooms if not any(fnmatch(room, name) for name in named)} == set()
 

@@ -75,16 +75,16 @@ TRIALS: dict[str, tuple[Trial, ...]] = {
 }
 
 
-def core_names(tree: Path) -> list[str]:
-    """Return the names of the C core's source files on Linux, without suffix."""
+def core_files(tree: Path) -> list[str]:
+    """Return the paths in csrc/ of the C core's source files on Linux."""
     text = (tree / "csrc" / "CMakeLists.txt").read_text()
     (sources,) = re.findall(r"set\(SOURCES ([^)]+)\)", text)
     _windows, system = re.findall(r"set\(SYSTEM ([^)]+)\)", text)
-    return [Path(part).stem for part in sources.replace("${SYSTEM}", system).split()]
+    return sources.replace("${SYSTEM}", system).split()
 
 
 def _objects(tree: Path, directory: str, main: str) -> list[str]:
-    return [f"{directory}/{name}.o" for name in (main, *core_names(tree))]
+    return [f"{directory}/{Path(name).stem}.o" for name in (main, *core_files(tree))]
 
 
 def _link(tree: Path) -> None:
@@ -128,7 +128,7 @@ def scratch() -> Iterator[Path]:
             (tree / name).mkdir()
         _must(tree, sys.executable, "csrc/cdef.py", "module/_core.c")
         headers = f"-I{sysconfig.get_path('include')}"
-        sources = {name: f"csrc/{name}.c" for name in core_names(tree)}
+        sources = {Path(name).stem: f"csrc/{name}" for name in core_files(tree)}
         for name, source in {"test_core": "tests/c/test_core.c", **sources}.items():
             _must(tree, CC, *SANITIZED, "-c", source, "-o", f"checked/{name}.o")
         for name, source in {"_core": "module/_core.c", **sources}.items():
