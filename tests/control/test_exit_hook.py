@@ -18,7 +18,7 @@ from lines import PATIENCE, line, plant, polled, until
 from motors import ReceivedRequests
 
 from multidrop.bus import Bus
-from multidrop.control.exit_hook import CUT_SHORT, ExitHook, LastAct
+from multidrop.control.exit_hook import CUT_SHORT, ExitHook, ExitTask
 from multidrop.families import InvtCHE
 from multidrop.poller import Poller
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
@@ -228,10 +228,10 @@ def test_adding_an_action_at_exit_raises_if_no_signal_handler_can_be_installed(
     first = hook.add(acts[0].begin, acts[0].work)
     has_taken, goes_on, told = threading.Event(), threading.Event(), list[ValueError]()
 
-    def make(*details: Any) -> LastAct:
+    def make(*details: Any) -> ExitTask:
         has_taken.set()
         assert goes_on.wait(PATIENCE)
-        return LastAct(*details)
+        return ExitTask(*details)
 
     def add() -> None:
         try:
@@ -239,7 +239,7 @@ def test_adding_an_action_at_exit_raises_if_no_signal_handler_can_be_installed(
         except ValueError as mistake:
             told.append(mistake)
 
-    monkeypatch.setattr("multidrop.control.exit_hook.LastAct", make)
+    monkeypatch.setattr("multidrop.control.exit_hook.ExitTask", make)
     thread = threading.Thread(target=add)
     thread.start()
     assert has_taken.wait(PATIENCE)
@@ -332,7 +332,7 @@ def test_a_bus_made_on_a_thread_warns_if_the_program_replaced_a_signal_handler(
     hook, handled = ExitHook(), list[int]()
     hook.add(lambda: None, lambda: None)
     signal.signal(signal.SIGTERM, lambda number, frame: handled.append(number))
-    acts = list[LastAct]()
+    acts = list[ExitTask]()
     thread = threading.Thread(target=lambda: acts.append(hook.add(lambda: None, lambda: None)))
     thread.start()
     thread.join(PATIENCE)

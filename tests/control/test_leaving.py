@@ -119,7 +119,7 @@ def test_closing_a_bus_waits_for_all_stops_unless_a_third_signal_comes(
     pair.bus.stop_on_exit()
     waited: list[object] = []
     monkeypatch.setattr(pair.bus._latches, "await_stops", lambda *drives: waited.append(drives))
-    act = pair.bus._leaving._last_act
+    act = pair.bus._leaving._exit_task
     assert act is not None
     until_over = act.finish
 

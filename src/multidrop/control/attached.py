@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, TypeVar
 
 from multidrop.control.call import MOST_EXPIRY_S, Call, Latches, check_expiry
-from multidrop.control.exit_hook import LastAct, exit_hook
+from multidrop.control.exit_hook import ExitTask, exit_hook
 from multidrop.control.outcome import Outcome, Stopped
 from multidrop.control.performer import Performer
 from multidrop.control.stops import Stopper
@@ -177,22 +177,22 @@ class Leaving:
         self._latches = latches
         self._stopper = stopper
         self._stop_all = stop_all
-        self._last_act: LastAct | None = None
+        self._exit_task: ExitTask | None = None
         # results of the stops at exit, by drive name
         self.found: Mapping[str, Stopped] = {}
 
     @property
     def stops(self) -> bool:
         """True once `stop_on_exit` was called."""
-        return self._last_act is not None
+        return self._exit_task is not None
 
     def stop_on_exit(self) -> None:
         """Stop all drives when the bus is closed or the process ends.
 
         The first call raises ValueError outside the main thread.
         """
-        if self._last_act is None:
-            self._last_act = exit_hook().add(
+        if self._exit_task is None:
+            self._exit_task = exit_hook().add(
                 self._latches.shut, self._act, lambda: [drive.name for drive in self._drives()]
             )
 
@@ -206,15 +206,15 @@ class Leaving:
         Does not wait for the end of the stops.
         """
         self._latches.shut()
-        if self._last_act is not None:
-            self._last_act.begin()
+        if self._exit_task is not None:
+            self._exit_task.begin()
 
     def finish(self) -> None:
         """Cancel all calls, stop the drives if `stop_on_exit` was called, and wait for all stops."""
         self.begin()
-        if self._last_act is not None:
-            exit_hook().finish(self._last_act)
-        if self._last_act is None or not self._last_act.is_cut_short:
+        if self._exit_task is not None:
+            exit_hook().finish(self._exit_task)
+        if self._exit_task is None or not self._exit_task.is_cut_short:
             self._latches.await_stops()
 
     def part_with(self, drives: Sequence[Drive], to_stop: Sequence[Drive]) -> None:

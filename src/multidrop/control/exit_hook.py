@@ -1,7 +1,7 @@
 """ExitHook: before this process ends, stop the drives of all buses with `stop_on_exit`.
 
-A process has one hook, for its exit and for SIGINT, SIGTERM and SIGHUP. A bus registers its stops there as a
-"last act", which runs in its own thread. The signal handler starts the last acts without waiting for them,
+A process has one hook, for its exit and for SIGINT, SIGTERM and SIGHUP. A bus registers its stops there as an
+"exit task", which runs in its own thread. The signal handler starts the exit tasks without waiting for them,
 because they may need a lock that the interrupted thread holds.
 """
 
@@ -69,7 +69,7 @@ def _listed(names: list[str]) -> str:
 _log = logging.getLogger("multidrop.control")
 
 
-class LastAct:
+class ExitTask:
     """Work that is done once at the process's end, by a thread that is started in advance.
 
     `drives` returns the names of the drives that the work stops.
@@ -88,7 +88,7 @@ class LastAct:
         self._on_over = over
         self._calls: SimpleQueue[None] = SimpleQueue()  # safe in a signal handler, unlike an Event
         self._over = threading.Event()
-        self.is_cut_short = False  # whether a signal ended the wait for the work
+        self.is_cut_short = False  # whether a third signal ended the wait for the work
         threading.Thread(target=self._run, name="multidrop exit", daemon=True).start()
 
     @property
@@ -123,7 +123,7 @@ class LastAct:
 
 
 class ExitHook:
-    """Starts all last acts at exit or on a signal, and delays the signal's effect until they are over.
+    """Starts all exit tasks at exit or on a signal, and delays the signal's effect until they have ended.
 
     The hook immediately prints which drives are being stopped, and how to end the wait. After the stops the
     signal has the effect that it would have without this hook. A third signal within a second (see IMPATIENT)
@@ -131,9 +131,9 @@ class ExitHook:
     """
 
     def __init__(self) -> None:
-        # changed by atomic operations only, because any thread may add and remove acts
-        self._acts: list[LastAct] = []
-        # by signal: the handler of the program that ours replaced
+        # changed by atomic operations only, because any thread may add and remove tasks
+        self._tasks: list[ExitTask] = []
+        # the program's own signal handlers, which this hook has replaced
         self._before: dict[signal.Signals, Any] = {}
         self._has_taken = False
         self._held: int | None = None  # number of the signal whose effect is delayed; None: no signal came
@@ -147,29 +147,29 @@ class ExitHook:
     def forked(self) -> None:
         self._passing = threading.Lock()
         self._held, self._came = None, []
-        for act in self._acts:
-            act.forget()
-        self._acts = []
+        for task in self._tasks:
+            task.forget()
+        self._tasks = []
 
     def add(
         self, begin: Callable[[], object], work: Callable[[], object], drives: Callable[[], list[str]] = list
-    ) -> LastAct:
+    ) -> ExitTask:
         """Do `work` before the process ends; `begin` is called first, possibly in a signal handler.
 
         Raises ValueError outside the main thread, unless our signal handlers are already installed.
         """
         self.take_signals()
-        act = LastAct(begin, work, self._one_is_over, drives)
-        self._acts.append(act)
+        task = ExitTask(begin, work, self._one_is_over, drives)
+        self._tasks.append(task)
         try:
             self.take_signals()  # closing another bus may have restored the old handlers meanwhile
         except ValueError:
-            self._acts.remove(act)
+            self._tasks.remove(task)
             raise
         self._warn_of_replaced()
         if self._held is not None:  # the process is already ending
-            act.begin()
-        return act
+            task.begin()
+        return task
 
     def take_signals(self) -> None:
         """Install our signal handlers, which call the earlier handlers after the stops.
@@ -190,63 +190,63 @@ class ExitHook:
         if lost := [number.name for number in _SIGNALS if signal.getsignal(number) != self._on_signal]:
             _log.warning(REPLACED, " and ".join(lost))
 
-    def finish(self, act: LastAct) -> None:
-        """Carry out a last act now, and remove it."""
-        act.finish()
-        with suppress(ValueError):  # another thread has already removed the act
-            self._acts.remove(act)
+    def finish(self, task: ExitTask) -> None:
+        """Carry out an exit task now, and remove it."""
+        task.finish()
+        with suppress(ValueError):  # another thread has already removed the task
+            self._tasks.remove(task)
         self.rest()
 
     def rest(self) -> None:
-        """If no last act is left, restore the earlier handlers. Does nothing outside the main thread."""
-        if not self._acts and self._held is None and threading.current_thread() is threading.main_thread():
+        """If no exit task is left, restore the earlier handlers. Does nothing outside the main thread."""
+        if not self._tasks and self._held is None and threading.current_thread() is threading.main_thread():
             self._let_go()
-            if self._acts:  # another thread has added an act
+            if self._tasks:  # another thread has added an task
                 self.take_signals()
 
     def _at_exit(self) -> None:
-        acts = [*self._acts]
-        for act in acts:
-            act.begin()
-        for act in acts:
-            act.finish()
+        tasks = [*self._tasks]
+        for task in tasks:
+            task.begin()
+        for task in tasks:
+            task.finish()
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        """Start the last acts. Takes no lock that the interrupted main thread may hold."""
+        """Start the exit tasks. Takes no lock that the interrupted main thread may hold."""
         now = time.monotonic()
         if number in _SIGNALS:  # not SIGHUP: a closing terminal may send it several times
             self._came = [*(at for at in self._came if now - at < 1.0), now]
         is_first = self._held is None
         if is_first:
             self._held, self._has_passed = number, False
-        acts = [*self._acts]
-        for act in acts:
-            act.begin()
-        names = [name for act in acts if not act.is_over for name in act.drives()]
+        tasks = [*self._tasks]
+        for task in tasks:
+            task.begin()
+        names = [name for task in tasks if not task.is_over for name in task.drives()]
         if is_first and names:
             _print_error(STOPPING.format(signal.Signals(number).name, _listed(names)))
-        if all(act.is_over for act in acts):
+        if all(task.is_over for task in tasks):
             self._pass_on(number, frame)
         elif len(self._came) >= IMPATIENT:
             _print_error(CUT_SHORT)
-            for act in acts:
-                act.is_cut_short = True
+            for task in tasks:
+                task.is_cut_short = True
             self._pass_on(number, frame)
 
     def _one_is_over(self) -> None:
-        """If all last acts are over, send the delayed signal to the main thread."""
+        """If all exit tasks have ended, send the delayed signal to the main thread."""
         with self._passing:
             held, ident = self._held, threading.main_thread().ident
             if self._has_passed or held is None or ident is None:
                 return
-            if not all(act.is_over for act in [*self._acts]):
+            if not all(task.is_over for task in [*self._tasks]):
                 return
             self._has_passed = True
         _send(held, ident)
 
     @property
     def delays_signal(self) -> bool:
-        """True while the effect of a signal is delayed until the last acts are over."""
+        """True while the effect of a signal is delayed until the exit tasks have ended."""
         return self._held is not None
 
     def await_effect(self) -> None:
