@@ -244,7 +244,7 @@ def _raw(value: float, format: str, coding: Coding) -> float:
     if not least <= Fraction(value) <= most:
         raise ValueError(f"{value:g} does not fit into {format}: {float(least):g} to {float(most):g}")
     if coding.number_format not in FLOATS and value != int(value):
-        raise ValueError(f"{value:g} is not a whole number, which {format} holds")
+        raise ValueError(f"{value:g} is not a whole number, as {format} needs")
     return coding.count_of(value)
 
 

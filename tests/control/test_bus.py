@@ -197,7 +197,7 @@ MISTAKES: dict[type[Exception], list[tuple[Callable[[Bus, Any], Any], str]]] = {
     WriteForbidden: [
         (lambda bus, rig: rig.write(rig.speed, 1), "speed of pump is not written: it is a reading"),
         (lambda bus, rig: rig.write(rig.sealed, 1), "sealed of pump is not written: it is the maker's"),
-        (lambda bus, rig: bus.broadcast(rig.target, 0), "has no harmless broadcast of target"),
+        (lambda bus, rig: bus.broadcast(rig.target, 0), "target = 0 cannot be broadcast"),
     ],
     ValueError: [
         (lambda bus, rig: rig.write(rig.target, 3001), "target = 3001 is outside 0 to 3000 rpm"),

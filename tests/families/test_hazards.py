@@ -140,7 +140,7 @@ HAZARDS = {
         refuses="never written together",
     ),
     "0.7: only a stop and a setpoint of zero are broadcast": Hazard(
-        ibd, broadcast("frequency", 50.0), naive="00 06 20 01 13 88", refuses="no harmless broadcast"
+        ibd, broadcast("frequency", 50.0), naive="00 06 20 01 13 88", refuses="the manual does not allow it"
     ),
     # ---- 1: ERMAN ----
     "E3: the example of 06 writes the setpoint to 0001H": Hazard(
@@ -190,7 +190,7 @@ HAZARDS = {
         shows={"status": ErmanStatus.RUNNING},
     ),
     "E18: nothing is broadcast, because drives may reply": Hazard(
-        erman, broadcast("frequency", 0.0), naive="00 06 00 02 00 00", refuses="no harmless broadcast"
+        erman, broadcast("frequency", 0.0), naive="00 06 00 02 00 00", refuses="the manual does not allow it"
     ),
     # ---- 2: INVT CHE ----
     "I1: no ordinal is computed: P0.07 has no address here": Hazard(
@@ -279,7 +279,10 @@ HAZARDS = {
         shows={"frequency": 20.0},
     ),
     "D17: a stored write is not broadcast": Hazard(
-        native, broadcast("stored_frequency", 0.0), naive=":0006000200000000", refuses="no harmless broadcast"
+        native,
+        broadcast("stored_frequency", 0.0),
+        naive=":0006000200000000",
+        refuses="the manual does not allow it",
     ),
     "4.4: the setpoint in RAM, not the stored one": Hazard(
         native, frequency(50), naive=":0106000200001388", sends=(":0104000100001388",)
@@ -324,7 +327,7 @@ HAZARDS = {
         yd,
         broadcast("control", YD1000Control.COMMAND_VALID | YD1000Control.EMERGENCY_STOP),
         naive="00 06 10 00 90 00",
-        refuses="no harmless broadcast",
+        refuses="the manual does not allow it",
     ),
 }
 

@@ -186,7 +186,7 @@ class Performer:
 
 
 def _check(step: Step, call: Call, cancelled: list[CancelledByStop]) -> None:
-    """Raise CancelledByStop if a stop was called, and _Over if the script then continues.
+    """Raise CancelledByStop after a stop. If the script catches this error and continues, raise _Over.
 
     A verb's script ends at its next step, any other script at its next write. An `Insist` step is always
     carried out, because it is harmless and undoes an earlier write.
@@ -253,7 +253,10 @@ class Broadcaster:
         first = drives[0]
         raw = raw_count(first, register, value)
         if raw not in register.broadcast:
-            raise WriteForbidden(f"{first.title} has no harmless broadcast of {register.name} = {value}")
+            raise WriteForbidden(
+                f"{register.name} = {value} cannot be broadcast to {first.title} drives: the manual does not "
+                "allow it, or it may move a motor"
+            )
         for drive in drives:
             check_broadcast(drive, register, raw)
         if is_harmless(register, raw):
