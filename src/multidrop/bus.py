@@ -185,11 +185,11 @@ class Bus:
             raise
 
     def leave(self) -> None:
-        """Cancel all calls that move a motor; if `stop_on_exit` is set, start to stop the drives."""
+        """Cancel all calls that move a motor. If `stop_on_exit` is set, another thread stops the drives."""
         self._leaving.begin()
 
     def part(self) -> None:
-        """Cancel calls and start stops like `leave`, then wait for all pending stops. The port stays open."""
+        """Do the same as `leave`, and wait for all pending stops. The port stays open."""
         self._leaving.finish()
 
     def close(self) -> None:
@@ -216,7 +216,7 @@ class Bus:
                 self._attached.free()
 
     def note_reopening(self, is_under_way: bool) -> None:
-        """Set whether a poller is reopening the lost port now; if not, stops reopen it."""
+        """Set whether a poller is now reopening the lost port. Otherwise a stop reopens the port itself."""
         self._stopper.is_reopening = is_under_way
 
     # ---- the drives ----

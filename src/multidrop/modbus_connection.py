@@ -75,11 +75,11 @@ def _family_of(params: Any, timeout: float) -> type[ModbusDevice]:
 
 
 class ModbusConnection(neutral.ModbusConnection):  # type: ignore[misc]
-    """A connection of `modbus-connection` through a `Bus`.
+    """A connection of the package `modbus-connection`, whose requests are sent through a `Bus`.
 
-    `params` and the times, in s, are the same as for other backends. A read is sent up to three times within
-    `timeout`, a write once. `options` are arguments of `Bus`, such as `audit` or `rs485`. Raises ValueError
-    for UDP and TLS.
+    `params` and the times, in s, are those of the package's other backends. A read is sent up to three times
+    within `timeout`, a write once. `options` are arguments of `Bus`, such as `audit` or `rs485`. Raises
+    ValueError for UDP and TLS.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Calls that may move a motor: their progress and deadlines, and the latches by which stops cancel them."""
+"""Calls that may move a motor: their progress, their deadlines, and their cancellation by stops."""
 
 from __future__ import annotations
 
@@ -26,9 +26,10 @@ POLL_S = 0.005  # s between checks whether all stops have ended
 
 
 class Latches:
-    """The unfinished stops of a bus, and a latch for each of its drives.
+    """The unfinished stops of a bus, and for each of its drives a `Latch`, with which stops cancel calls.
 
-    A latch counts the stops of its drive, so that each stop cancels the calls that were made before it.
+    A latch counts the stops of its drive. The core sends no write of a call that was made before the newest
+    stop, during a stop, or after the latch was shut.
     """
 
     def __init__(self, exchanges: Exchanges) -> None:
@@ -39,7 +40,7 @@ class Latches:
         self._stops: dict[object, tuple[int, frozenset[Drive]]] = {}
 
     def forked(self) -> None:
-        """In a forked child, shut all latches, which cancels all calls, and forget the parent's stops."""
+        """In a forked child, cancel all present and future calls, and forget the parent's pending stops."""
         self._stops = {}
         self.shut()
 
@@ -78,7 +79,7 @@ class Latches:
             time.sleep(POLL_S)
 
     def latch(self, drive: Drive) -> Latch:
-        """Return a drive's latch. Raises NotAttached if the drive is not on this bus."""
+        """Return the `Latch` that cancels this drive's calls. Raises NotAttached if it is not on this bus."""
         self._exchanges.peers.of(drive)  # raises NotAttached
         latch = self._latches.get(drive)
         if latch is None:  # the drive is being removed
@@ -255,16 +256,17 @@ def written_before(limit: Limit) -> Iterator[None]:
     """Within the block, raise Expired if a call's first write cannot be sent by the time of `limit`.
 
     `limit` is called at the start of each call. It returns a time in ns on the clock of
-    `time.monotonic_ns()`; a time of 0 has always passed. A stop that is called after `limit` returned cancels
-    the call. So no write is sent after a stop if `limit` returns 0 as soon as the program knows of that stop.
-    Time that the computer sleeps within the block counts. A verb's later writes expire by the bus's own
-    `expiry`. Stops are always sent.
+    `time.monotonic_ns()`; a time of 0 has always passed. If the computer sleeps within the block, that time
+    counts. A verb's later writes expire by the bus's own `expiry`. Stops are always sent.
+
+    A stop cancels each call whose `limit` has already returned. If `limit` returns 0 from the moment when the
+    program knows of the stop, later calls send nothing either. Then no write is sent after the stop.
 
     The block applies to this thread, or to this task and its calls of `asyncio.to_thread`. If `limit` is not
     a function, each call except a stop raises TypeError.
     """
     outer = _limit.get()
-    # boot time is read first: a pause between the two reads cannot make the difference too large
+    # `boottime_ns` is called first: a pause between the two calls makes the deadline earlier, never later
     slept_ns = clock.boottime_ns() - clock.now_ns()
     token = _limit.set(lambda: min(outer(), _called(limit) + slept_ns))
     try:

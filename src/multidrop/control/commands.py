@@ -274,9 +274,10 @@ class RepeatedStops:
         return [drive for drive in drives if drive not in again], again
 
     def send_once(self, drive: Drive) -> StopFuture:
-        """Send a drive one more stop beside its repeated stop; return a future for the repeated stop.
+        """Send a single stop to a drive whose stop is already being repeated.
 
-        If the repeated stop gives up less than REPEATED_S after this call, start another one.
+        Return a future for the result of the repeated stop. If the repeated stop gives up less than
+        REPEATED_S after this call, another one is started.
         """
         task = asyncio.ensure_future(self._send_and_await(drive))
         self._tasks.add(task)  # the task continues if its caller is cancelled
@@ -331,7 +332,7 @@ class JoinedStops:
     """
 
     def __init__(self) -> None:
-        self._running: Counter[object] = Counter()  # number of stops in progress by their drives
+        self._running: Counter[object] = Counter()  # number of unfinished stops of the same drives
         self._joined: dict[object, asyncio.Future[Any]] = {}  # stops that are started after JOIN_S
 
     def begin(self, drives: object, start: Callable[[], asyncio.Future[R]]) -> asyncio.Future[R]:

@@ -102,7 +102,7 @@ class Ledger:
         return ""
 
     def note(self, cells: Sequence[LedgerCell], now: float) -> None:
-        """Count the writes of stops in one transaction, even beyond the budget.
+        """Count writes that stops have sent, in one transaction, even if the yearly budget is used up.
 
         Waits up to 5 s if another process has locked the file. Raises OSError if it cannot be written.
         """

@@ -107,7 +107,7 @@ class _Findings:
         self.confirmed: _Confirmed | None = None
         self.stops: set[float] = set()  # raw counts that `check_before_stop` has allowed
         self.suspicion: Suspicion | None = None  # the suspicion of the previous check before a stop
-        self.doubt = ""  # the suspicion in spite of which a stop was sent
+        self.doubt = ""  # why the drive seemed to be of another family when a stop was sent
 
 
 class IdentityCheck:
@@ -162,7 +162,7 @@ class IdentityCheck:
             make = self._shown(drive, _of_same_register(drive), timed)
             if make is None:
                 raise
-            raise WriteForbidden(f"{refusal}; {_declare(make)}", rule=refusal.rule) from refusal
+            raise WriteForbidden(f"{refusal}; {_answers_like(make)}", rule=refusal.rule) from refusal
         except DriveException as refusal:
             kind = drive.title or type(drive).__name__
             raise WriteForbidden(
@@ -180,16 +180,16 @@ class IdentityCheck:
     def _exclude(self, drive: Drive, makes: Sequence[Make], timed: Timed, silences: int) -> int:
         """Raise WriteForbidden if the drive's registers show one of these makes.
 
-        A drive may leave a read of a register that it lacks unanswered. So might a drive of one of these
-        makes, by chance, if a reply is lost. Therefore the check is repeated after a missing reply. Returns
-        `silences`, plus the number of replies that are missing only because the drive lacks these registers.
+        A missing reply has two possible causes. The drive may lack the register that was read, or the drive
+        may be of one of these makes and its reply was lost. So the check is repeated after a missing reply.
+        Returns `silences`, plus the number of replies that are missing because the drive lacks the registers.
         """
         peer = self._exchanges.peers.of(drive)
         for _ in range(SURE):
             before = peer.silences
             make = self._shown(drive, makes, timed)
             if make is not None:
-                why = f"nothing is written to {drive.name}: {_declare(make)}"
+                why = f"nothing is written to {drive.name}: {_answers_like(make)}"
                 raise WriteForbidden(why, rule="it shows another make")
             if peer.silences == before:
                 break
@@ -233,7 +233,7 @@ class IdentityCheck:
         rivals = run_by(register, count)
         suspicion = self._suspicion(drive, rivals) if self._is_in_step(drive) else None
         before, findings.suspicion = findings.suspicion, None
-        # `make` is set only if the registers showed this make SURE times
+        # a suspicion that names a make is already the result of SURE checks
         if suspicion is not None and suspicion.make is not None:
             raise _withheld(drive, suspicion.why, suspicion.make)
         if suspicion is not None and before is None:
@@ -263,7 +263,8 @@ class IdentityCheck:
     def _suspicion(self, drive: Drive, rivals: Sequence[Make]) -> Suspicion | None:
         """Run the family's `identify` once; return a suspicion if the drive seems to be of another family.
 
-        The registers of the makes in `rivals` are read only if the family's identity is weak.
+        If `identify` alone cannot exclude other makes (`identity_is_weak`), also read the registers that show
+        the makes in `rivals`.
         """
         findings, silences = self._findings(drive), self._exchanges.peers.of(drive).silences
         refused = None
@@ -297,15 +298,15 @@ class IdentityCheck:
         return None
 
     def _rival(self, drive: Drive, rivals: Sequence[Make]) -> Suspicion | None:
-        """Return a suspicion if the family's identity is weak and the drive answers as one of these makes."""
+        """Return a suspicion if `identify` cannot exclude these makes and the drive answers like one."""
         makes = self._while_in_step(drive, rivals)
         make = self._shown(drive, makes) if drive.identity_is_weak else None
-        return None if make is None else Suspicion(_declare(make), make=make)
+        return None if make is None else Suspicion(_answers_like(make), make=make)
 
     def _shown(self, drive: Drive, makes: Iterable[Make], timed: Timed = nullcontext) -> Make | None:
-        """Return the first of these makes that the drive's registers show SURE times, or None.
+        """Return the first of these makes that SURE checks of the drive's registers all show, or None.
 
-        After a request without a reply, only makes that may leave a request unanswered are still tried.
+        After a missing reply, skip the makes that answer each request.
         """
         try:
             probe = Evidence(
@@ -328,7 +329,10 @@ class IdentityCheck:
         return None
 
     def _while_in_step(self, drive: Drive, makes: Iterable[Make]) -> Iterator[Make]:
-        """Yield these makes until a late reply could be taken for a reply that shows the next one."""
+        """Yield these makes as long as the drive answers each request in time.
+
+        After a late reply, a later reply could be mistaken for the answer to another request.
+        """
         for make in makes:
             yield make
             if not self._is_in_step(drive):
@@ -342,7 +346,9 @@ class IdentityCheck:
         """
         settings = drive.settings
         for family in MODELS.values():
-            if isinstance(drive, family) or not family.identify_recognises or _stops(family, register, count):
+            if isinstance(drive, family) or not family.identify_recognises:
+                continue
+            if _is_harmless_in(family, register, count):
                 continue
             with suppress(ValueError):  # raised if no drive of `other` can be on this line
                 other = family(
@@ -386,8 +392,8 @@ def _of_same_register(drive: Drive) -> list[Make]:
     return [make for make in MAKES if control is not None and make.control == control.address]
 
 
-def _stops(family: type[Drive], register: Register[Any], count: float) -> bool:
-    """Return True if a raw count at this register is harmless in the family, such as the family's stop."""
+def _is_harmless_in(family: type[Drive], register: Register[Any], count: float) -> bool:
+    """Return True if this write is harmless to a drive of the family, because it is the family's stop."""
     control = family.registers.get("control")
     return (
         control is not None
@@ -396,7 +402,7 @@ def _stops(family: type[Drive], register: Register[Any], count: float) -> bool:
     )
 
 
-def _declare(make: Make) -> str:
+def _answers_like(make: Make) -> str:
     return f"it answers as {_with_article(make.title)} does; if it is one, declare model {make.model}"
 
 

@@ -19,7 +19,8 @@ from multidrop.errors import NotAttached, WriteForbidden
 from multidrop.printable import is_number
 from multidrop.transport import clock
 
-# s between reads of waiting drives: a drive silent for PAUSE_NS may have lost its power (identity.py)
+# Seconds between reads of the drives that wait for their start. A drive that is silent for PAUSE_NS may have
+# lost its power.
 HEARD_S = PAUSE_NS / 2e9
 # A start that comes later than planned expires. Delays up to these limits (s) do not count as late.
 WAIT_SLACK_S, READ_S = 2.0, 5.0  # limits for one wait, and for the reads of one waiting drive
@@ -63,10 +64,10 @@ def _is_safe_to_stop(drive: Drive, call: Call | None) -> bool:
 
 
 def _await_turn(waiting: Sequence[Drive], gap: float, unheard_s: float, call: Call | None) -> float:
-    """Wait for `gap` s, and read the drives that wait for their start every HEARD_S.
+    """Wait for `gap` seconds. Every HEARD_S seconds of the wait, read the drives in `waiting`.
 
-    `unheard_s` is the time since their last read; return this time after the wait. If the process is
-    suspended during the wait, that time counts towards the expiry of `call`: the next start may expire.
+    `unheard_s` is the time in s since the drives' last read; return its new value after the wait. If the
+    process is suspended during the wait, the next start may expire: `call` counts that time as lateness.
     """
 
     def planned(seconds: float) -> AbstractContextManager[None]:

@@ -51,7 +51,7 @@ class AuditLog:
         self._file = _opened(self.path)
 
     def add(self, utc_ns: int, record: dict[str, Any]) -> None:
-        """Append a record. Raises OSError, even if a part of the record was written."""
+        """Append a record. Raises OSError if it was not written completely."""
         line = json.dumps({"time": format_time(utc_ns), **record}, ensure_ascii=False)
         whole = (b"\n" if self._is_truncated() else b"") + line.encode(errors="backslashreplace") + b"\n"
         if self._file.write(whole) < len(whole):
@@ -200,8 +200,8 @@ def _spelt(given: object) -> str:
 
 
 CALLED = "called"  # outcome in the record of a write or a stop that is about to be sent
-UNSENT = "not sent"  # outcome in the record of a write after CALLED, if it was not sent
-REFUSED = "refused"  # outcome in the record of a write that was not sent
+UNSENT = "not sent"  # outcome of a write that was recorded as CALLED and then not sent
+REFUSED = "refused"  # outcome of a write that a gateway refused
 CALLED_S = 0.05  # s; longest time that a stop waits until its audit record is written
 CLOSING_NS = 1_000_000_000  # longest time that closing the audit log waits for records of other threads
 
@@ -256,7 +256,10 @@ class WriteRecords:
         self._put(self._record(drive, request, what, effect.value, why, held), partial(log_aside, _log))
 
     def note_called(self, drive: Drive, request: Message, what: str) -> None:
-        """Within `noted_first`, record that this write is about to be sent. Raises OSError if that fails."""
+        """In a `noted_first` block, record that this write is about to be sent. Otherwise do nothing.
+
+        Raises OSError if the record cannot be written.
+        """
         if self.audit is None or not _noted_first.get():
             return
         record = self._record(drive, request, what, CALLED, "", None)
@@ -266,7 +269,7 @@ class WriteRecords:
             raise OSError(f"{what} was not sent: the audit log cannot be written: {self.audit_trouble}")
 
     def note_unsent(self, drive: Drive, request: Message, what: str, failure: BaseException) -> None:
-        """Within `noted_first`, record that a write was not sent although `note_called` has recorded it."""
+        """In a `noted_first` block, record that a write was not sent after all. Otherwise do nothing."""
         if self.audit is None or not _noted_first.get():
             return
         record = self._record(drive, request, what, UNSENT, str(failure) or type(failure).__name__, None)
@@ -349,7 +352,7 @@ class WriteRecords:
         self.catch_up_aside()
         for thread in (_audit_thread, _ledger_thread):
             if not thread.hangs(seconds) and not thread.flush(seconds) and not thread.hangs(seconds):
-                self.catch_up()  # the system has no thread left
+                self.catch_up()  # on this thread, because the separate thread could not be started
 
     def _write_queued(self) -> None:
         self._writers.append(None)  # entered before a record is taken, so that `close` waits for this thread
@@ -402,7 +405,7 @@ class WriteRecords:
 def _way_out(
     drive: Drive, register: Register[Any], kept: Kept, *, is_yearly: bool
 ) -> tuple[str, Advice | None]:
-    """Return a hint on how to make a write that the ledger refuses, and its Advice; None if there is none."""
+    """Return a hint on how to set a register whose write the ledger has refused, and an Advice or None."""
     if kept is Kept.UNKNOWN:
         declared = f'ram = ["{register.name}"]'
         written = f"write {declared} below its [[line.drive]]"

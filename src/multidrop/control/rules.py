@@ -47,10 +47,10 @@ def raw_count(drive: Drive, register: Register[T], value: T) -> float:
 
 
 def check_known(drive: Drive, register: Register[Any], raw: float) -> None:
-    """Raise WriteForbidden if this may command the motor and the owner has not confirmed the drive's class.
+    """Raise WriteForbidden if this write may command the motor and needs the drive's option `confirmed`.
 
-    A stop needs no confirmation. If the class is from a family file, all other raw counts need the owner's
-    confirmation, even harmless ones.
+    A stop does not need the option. If the drive's class is from a family file, all other writes need it,
+    even harmless ones.
     """
     is_unproven = bool(drive.declared_in) and "confirmed" in drive.options  # the family file may be wrong
     if is_harmless(register, raw):
@@ -61,10 +61,9 @@ def check_known(drive: Drive, register: Register[Any], raw: float) -> None:
 
 
 def check_plain(drive: Drive, register: Register[Any], raw: float) -> None:
-    """Raise WriteForbidden if only a verb may send this write, such as one that starts a motor.
+    """Raise WriteForbidden for a write that may move the motor: only verbs such as `start` may send it.
 
-    A command that does not move the motor by itself is allowed, unless the owner must first confirm the
-    drive's class.
+    Other writes are allowed, unless they need the drive's option `confirmed` (see `check_known`).
     """
     if is_harmless(register, raw) or not register.commands:
         check_known(drive, register, raw)
@@ -91,13 +90,13 @@ def _has(drive: Drive, name: str) -> bool:
 
 
 def check_broadcast(drive: Drive, register: Register[Any], raw: float) -> None:
-    """Raise WriteForbidden if this is not a stop and the owner has not confirmed the drive's class."""
+    """Raise WriteForbidden if this is not a stop and the drive's option `confirmed` is needed."""
     if not is_stop(drive, register, raw):
         drive.check_confirmed(register.name)
 
 
 def is_stop(drive: Drive, register: Register[Any], raw: float) -> bool:
-    """Return True if the raw count is harmless and the family has a stop."""
+    """Return True if this write is a stop: it may be sent at any time, and the family has a verb `stop`."""
     return is_harmless(register, raw) and _has(drive, "stop")
 
 
@@ -107,7 +106,7 @@ def is_harmless(register: Register[Any], raw: float) -> bool:
 
 
 def conditions(drive: Drive, register: Register[T], value: T) -> Script[None]:
-    """Read the registers and the motor state that the rules depend on.
+    """Read the register's limits from the drive, and check that `value` may be written now.
 
     Raises WriteForbidden if `value` is beyond a limit, or if the motor must be at rest and is not.
     """

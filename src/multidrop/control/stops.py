@@ -42,9 +42,9 @@ LEAST_S = 30.0  # s; how long a stop is repeated by default
 PAUSE_S = 0.2  # s; pause before a stop is repeated
 LOOK_S = 0.002  # s; pause between checks whether a poller has reopened a lost port
 AT_ONCE = 8  # after this many steps without a good reply, a stop shares the line with polling
-# after a stop's step without a good reply, polling has the line for this multiple of the step's duration
+# After a step without a good reply, a stop leaves the line to polling for SHARE times the step's duration.
 SHARE = 1.5
-MOST_STEPS = 8  # limit of a script's steps if an interrupted stop is sent once more
+MOST_STEPS = 8  # limit of the steps when an interrupted stop is sent once more
 UNSENT = (WriteForbidden, LineError, NotMaster, ValueError)
 WORTH_REPEATING = (Unconfirmed, NotVerified, NoReply, BadReply, DriveException, PortLost, NotMaster)
 UNANSWERED = (Unconfirmed, NoReply, BadReply)
@@ -373,7 +373,10 @@ class StopRun:
         self._release()
 
     def _begin(self) -> None:
-        """Cancel other calls; the first time, also create the attempts and record that a stop was called."""
+        """Cancel all calls that move these drives.
+
+        The first time, also create a StopAttempt for each drive, and record that a stop was called.
+        """
         stopper = self._stopper
         stopper.latches.begin(self, self._drives)
         if not self.attempts and self._drives:
@@ -402,7 +405,7 @@ class StopRun:
         latest = interruption
         try:
             self._begin()
-            # last: the stop of which a frame may already have been sent
+            # stops of which a frame may already have been sent come last
             for attempt in sorted(self._left(), key=StopAttempt.is_in_doubt):
                 attempt.once_more(self._stopper.do)
         except BaseException as another:
@@ -490,7 +493,7 @@ class Stopper:
             stop.doubt = self._writer.identity_check.doubt(stop.drive)
 
     def insist(self, drive: Drive, step: Write) -> Outcome:
-        """Write a count that stops the motor, after reopening a lost port; return the outcome."""
+        """Send a stop, or another write that is harmless at any time; first reopen a lost port."""
         checked: Checked = set()
 
         def write() -> Outcome:
@@ -498,7 +501,7 @@ class Stopper:
 
         try:
             return self._on_open_port(write)
-        except CheckAgain:  # check again immediately, because no other stop waits
+        except CheckAgain:  # no other drive must be stopped before the second check
             return self._on_open_port(write)
 
     def ready(self, drive: Drive) -> float:
@@ -528,9 +531,8 @@ class Stopper:
             self._regain_ns = now + REGAIN_NS
             try:
                 line.regain()
-            except (
-                PortLost
-            ):  # counted from the end of the attempt, because a network may delay it for seconds
+            except PortLost:
+                # the interval starts now, because a network may have delayed this attempt for seconds
                 self._regain_ns = clock.now_ns() + REGAIN_NS
                 raise
             self._regain_ns = 0

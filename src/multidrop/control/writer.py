@@ -35,7 +35,7 @@ from multidrop.transport.exchange import READ_FAILURES, Exchanges, good_reply
 
 ACKNOWLEDGED = 5  # exception code: the device accepted the request, but needs more time
 
-# the writes (register's name and raw count) of one stop before which the drive's family was checked
+# Writes (register name, raw count) of one stop that `check_before_stop` has allowed
 Checked = set[tuple[str, float]]
 
 
@@ -96,10 +96,11 @@ class Writer:
     ) -> Outcome:
         """Write a stop, or a raw count that is harmless at any time, without checking rules or the budget.
 
-        Raises WriteForbidden only on proof that the drive is of another family. That check is made once in a
-        stop, which keeps its set `checked`: a server that closes the connection after each reply would close
-        it after each check. On a line with late replies, waits up to `timeout` seconds for the write's own
-        reply. `log` records the write; by default, the record is queued until `catch_up`.
+        Raises WriteForbidden only on proof that the drive is of another family. A write in `checked` is not
+        checked again, even if the port was reopened: some servers close the connection after each reply, so
+        a repeated check would close it again before the write. On a line with late replies, waits up to
+        `timeout` seconds for the write's own reply. `log` records the write; by default, the record is queued
+        until `catch_up`.
         """
         register = step.register
         raw = raw_count(drive, register, step.value)
@@ -160,7 +161,7 @@ class Writer:
         return reply.data
 
     def broadcast(self, drive: Drive, register: Register[Any], raw: float, call: Call | None = None) -> None:
-        """Broadcast a write of one of this drive's registers. Without a call, the write is a stop."""
+        """Broadcast a write of one of this drive's registers. `call` is None for a stop."""
         request = write_request(drive, register, raw, address=0)
         what = _in_words(register, register.decode(raw))
         if call:
@@ -185,7 +186,7 @@ class Writer:
         timeout: float,
         log: Callable[..., None],
     ) -> Outcome:
-        """Send a write once; return its outcome. Without a call, the write is a stop, sent with `insists`."""
+        """Send a write once; return its outcome. `call` is None for a stop."""
         request, asked = write_request(drive, register, raw), register.decode(raw)
         what = _in_words(register, asked)
         is_setpoint = register.name == drive.setpoint_name
@@ -270,7 +271,7 @@ class Writer:
             return None, failure
 
     def _look(self, drive: Drive, step: Step, call: Call) -> Any:
-        """Carry out a step of a rule's check: wait, or read a register and return its value."""
+        """Carry out a step of `conditions`: wait, or read a register and return its value."""
         if isinstance(step, Wait):
             with call.step(step.seconds):
                 return clock.sleep(step.seconds)
