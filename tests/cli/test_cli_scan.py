@@ -141,6 +141,25 @@ def test_unit_ids_above_the_addresses_of_serial_lines_are_scanned_on_tcp(run: Ru
     assert all(f"address {unit}: " in out for unit in (0, 255))
 
 
+@pytest.mark.long
+def test_an_unknown_device_on_modbus_tcp_is_listed_once_without_a_baud_rate(run: Run, tmp_path: Path) -> None:
+    """The scan for all families has several TCP requests, whose families have different baud rates."""
+    model = tmp_path / "meter.toml"
+    model.write_text(
+        '[family]\ntitle = "T"\nmanual = "M"\ncounts_from = 0\n'
+        '[reading]\nlevel = { at = 1 }\nheat = { at = 1, table = "input" }\n'
+    )
+    meter = SimulatedDrive(find_model(str(model))(7, framing=Framing.TCP))
+    with Simulator([Wire([meter], port="tcp://127.0.0.1:0", unpaced=True)]) as line:
+        scan = ("scan", line.wires[0].path, "--addresses", "7")
+        status, out, _ = run(*scan)
+        _, as_json, _ = run(*scan, "--json")
+    assert status == 0
+    assert out.count("address 7: an unknown Modbus device at Modbus TCP") == 1
+    (device,) = json.loads(as_json)["drives"]
+    assert (device["baudrate"], device["format"], device["framing"]) == (None, None, "tcp")
+
+
 @table(
     ("words", "sentence"),
     [

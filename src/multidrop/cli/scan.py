@@ -28,7 +28,7 @@ from multidrop.cli.support.arguments import (
 from multidrop.cli.support.files import check_writable, write_new
 from multidrop.cli.support.output import print_json, print_text
 from multidrop.cli.support.values import counted, wrapped
-from multidrop.core import RS485
+from multidrop.core import RS485, Framing
 from multidrop.drive.declaration_check import UNIT_IDS
 from multidrop.drive.family import Drive
 from multidrop.drive.line_settings import SERIAL_ADDRESSES, speaks_tcp
@@ -44,6 +44,7 @@ from multidrop.scan import (
     Progress,
     Sweep,
     Untried,
+    line_setting,
     one_of_each_framing,
     over_tcp,
     plant_text,
@@ -263,7 +264,7 @@ def _shown(findings: Iterator[Finding], silent: bool) -> Iterator[Finding]:
     try:
         for finding in findings:
             if isinstance(finding, Progress):
-                setting, left = f"{finding.settings} {finding.framing}", _duration(finding.left)
+                setting, left = line_setting(finding.settings, finding.framing), _duration(finding.left)
                 if redraws:
                     _redraw(f"{setting}, address {finding.address}; {left} left")
                 elif setting != shown:
@@ -290,7 +291,7 @@ def _duration(seconds: float) -> str:
 
 
 def sentence(finding: Finding) -> str:
-    at = f"{finding.settings} {finding.framing}"
+    at = line_setting(finding.settings, finding.framing)
     match finding:
         case Found():
             what = " or ".join(finding.models) or "an unknown Modbus device"
@@ -345,6 +346,8 @@ def _record(finding: Finding) -> dict[str, Any]:
     if isinstance(finding, Found):
         found["response_delay_ms"] = round(found.pop("response_delay") * 1e3, 3)
     line = {"baudrate": settings.baudrate, "format": settings.format, "framing": str(framing)}
+    if framing is Framing.TCP:
+        line |= {"baudrate": None, "format": None}
     return place | line | found
 
 

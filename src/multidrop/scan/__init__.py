@@ -6,6 +6,7 @@ from multidrop.scan.findings import Found as Found
 from multidrop.scan.findings import Noise as Noise
 from multidrop.scan.findings import Progress as Progress
 from multidrop.scan.findings import Untried as Untried
+from multidrop.scan.findings import line_setting as line_setting
 from multidrop.scan.plant_writer import plant_text as plant_text
 from multidrop.scan.scanner import scan as scan
 from multidrop.scan.sweep import ADDRESSES as ADDRESSES

@@ -10,6 +10,11 @@ from multidrop.drive.line_settings import Settings
 GUESS = "it only reads like one: look at its name plate"
 
 
+def line_setting(settings: Settings, framing: Framing) -> str:
+    """Return a line setting as text, without a baud rate for Modbus TCP."""
+    return "Modbus TCP" if framing is Framing.TCP else f"{settings} {framing}"
+
+
 @dataclass(frozen=True)
 class Found:
     """A drive that answers; `models` are the equally likely families, empty if no family fits.

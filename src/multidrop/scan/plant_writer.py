@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from multidrop.core import RS485, Framing
 from multidrop.drive.family import Drive
 from multidrop.drive.line_settings import Settings
-from multidrop.scan.findings import GUESS, Found
+from multidrop.scan.findings import GUESS, Found, line_setting
 
 
 def candidate(family: type[Drive], settings: Settings, framing: Framing, address: int) -> Drive | None:
@@ -46,7 +46,7 @@ def plant_text(
     for device in sorted(found, key=lambda device: (not device.models, device.address)):
         address = device.address
         if not device.models:
-            unknown = f"an unknown Modbus device at {device.settings} {device.framing}"
+            unknown = f"an unknown Modbus device at {line_setting(device.settings, device.framing)}"
             tables.append(f"# address {address}: {unknown}\n")
             continue
         model = names[device.models[0]]

@@ -183,8 +183,11 @@ class _Scan:
 
 
 def _key(sweep: Sweep, address: int) -> tuple[int, Framing, int]:
-    """Return the key of a drive, without the format: a drive may answer in several formats."""
-    return address, sweep.framing, sweep.settings.baudrate
+    """Return the key of a drive, without the format: a drive may answer in several formats.
+
+    Over Modbus TCP, a drive also answers to every baud rate, because only the gateway uses it.
+    """
+    return address, sweep.framing, sweep.settings.baudrate if sweep.framing is not Framing.TCP else 0
 
 
 def _late(sweep: Sweep, earlier: Sequence[int], completion: Completion) -> list[int]:
