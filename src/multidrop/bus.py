@@ -231,7 +231,7 @@ class Bus:
 
         No request is sent; the identity of the drive is checked before its first write. Any thread may call
         this. Raises ValueError for an argument that the family does not allow, a taken address, or a drive on
-        another bus.
+        another bus. Raises LineError if this bus is closed.
         """
         line = {"baudrate": self.baudrate, "format": self.format, "silence": self.silence}
         attached = made(drive, address, line, details)

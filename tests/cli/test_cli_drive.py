@@ -423,7 +423,7 @@ def test_a_stop_on_a_port_in_use_is_reported_as_not_sent(run: Run, port: str) ->
     with BoundProcess(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
         assert other.stdout is not None
         assert other.stdout.readline() == b"held\n"
-        reason = f"{port}: it is in use by another program"
+        reason = f"{port}: it is in use by this or another program"
         assert run("read", port, TOY, 1) == (1, "", f"multidrop: {reason}\n")
         status, out, err = run("stop", port, "invt-che", 1)
         assert (status, out) == (1, "")

@@ -385,7 +385,7 @@ def test_sniff_reports_a_port_in_use(run: Run) -> None:
     master, slave = pty.openpty()
     fcntl.flock(slave, fcntl.LOCK_EX)
     port = os.ttyname(slave)
-    assert run("sniff", port) == (1, "", f"multidrop: {port}: it is in use by another program\n")
+    assert run("sniff", port) == (1, "", f"multidrop: {port}: it is in use by this or another program\n")
     os.close(master)
     os.close(slave)
 

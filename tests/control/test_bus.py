@@ -150,6 +150,13 @@ def test_baud_rate_and_format_of_a_bus_are_used_by_drives_without_their_own() ->
         assert str(bus.attach(Toy(3)).settings) == "9600 8N1"
 
 
+def test_a_drive_cannot_be_attached_to_a_closed_bus() -> None:
+    with unpaced(simulated(Toy(1))) as sim, Bus(path(sim)) as bus:
+        bus.close()
+        with pytest.raises(LineError, match="its bus is closed: open a new one for toy@1"):
+            bus.attach(Toy, 1)
+
+
 @patient
 def test_the_silence_of_a_bus_is_used_by_drives_without_their_own() -> None:
     """One bit time is added to the silence of the bus, as to the standard's t3.5."""

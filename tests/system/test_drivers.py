@@ -85,9 +85,9 @@ def test_scan_and_doctor_name_an_adapter_by_its_serial_number(guest: Guest) -> N
 def test_error_for_a_port_that_cannot_be_opened_gives_the_reason(guest: Guest) -> None:
     found = guest.run("refused_ports") | guest.run("absent_uart")
     for name, reason in {
-        "locked": "in use by another program",
-        "doctor of locked": "in use by another program",
-        "exclusive": "in use by another program",
+        "locked": "in use by this or another program",
+        "doctor of locked": "in use by this or another program",
+        "exclusive": "in use by this or another program",
         "no permission": "no permission",
         "doctor": "there is no UART behind this name",
         "ttyS3": "there is no UART behind this name",

@@ -251,7 +251,7 @@ def test_a_port_that_is_open_cannot_be_opened_by_another_bus() -> None:
         with Bus(port) as first:
             with pytest.raises(LineError) as caught:
                 Line(port).open()
-            assert str(caught.value) == f"{port}: it is in use by another program"
+            assert str(caught.value) == f"{port}: it is in use by this or another program"
             read_and_write(first)
         Line(port).open().close()
 

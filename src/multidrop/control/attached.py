@@ -21,6 +21,7 @@ from multidrop.drive.family import Drive, check_own, check_own_text
 from multidrop.drive.register import Register
 from multidrop.drive.text import Text
 from multidrop.drive.verbs import CalledStop, Script
+from multidrop.errors import LineError
 from multidrop.transport.aside_log import log_aside
 from multidrop.transport.exchange import Exchanges
 
@@ -123,8 +124,13 @@ class Attached:
         self._free(self.drives)
 
     def add(self, drive: Drive) -> None:
-        """Attach a drive. Raises ValueError if its address is taken, or if the drive is on another bus."""
+        """Attach a drive. Raises ValueError if its address is taken, or if the drive is on another bus.
+
+        Raises LineError if this bus is closed.
+        """
         with self.lock:
+            if not self._bus.is_open:
+                raise LineError(self._bus.line.port, f"its bus is closed: open a new one for {drive.name}")
             for other in self.drives:
                 if other.address == drive.address:
                     raise ValueError(f"address {drive.address} is taken by {other.name}")

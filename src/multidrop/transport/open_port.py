@@ -68,8 +68,8 @@ def overruns(fd: int) -> int:
 _REASONS = {
     errno.ENOENT: "there is no such port",
     errno.EACCES: "no permission to open it (is the user in the group that owns it?)",
-    errno.EAGAIN: "it is in use by another program",
-    errno.EBUSY: "it is in use by another program",
+    errno.EAGAIN: "it is in use by this or another program",
+    errno.EBUSY: "it is in use by this or another program",
     errno.ENOTTY: "it is not a serial port",
     errno.EIO: "it does not work: there is no UART behind this name, or its adapter failed",
     errno.EISDIR: "it is a directory, not a serial port",
