@@ -7,6 +7,7 @@ from multidrop.drive.family import verbs_of as verbs_of
 from multidrop.drive.known_state import FAULT_RECORDS as FAULT_RECORDS
 from multidrop.drive.known_state import StateReader as StateReader
 from multidrop.drive.known_state import can_show_fault as can_show_fault
+from multidrop.drive.number_format import SIGNED as SIGNED
 from multidrop.drive.options import Option
 from multidrop.drive.register import COIL as COIL
 from multidrop.drive.register import DISCRETE as DISCRETE

@@ -26,6 +26,7 @@ from tables import table
 
 from multidrop import Drive, InvtCHE, PolledDrive
 from multidrop.control import CommandOutcome, CommandResult
+from multidrop.drive.number_format import NumberFormat
 from multidrop.drive.register import reading, setting
 from multidrop.families import MODELS
 from multidrop.gateway.clock import boottime_ns
@@ -516,6 +517,18 @@ def command_of(part: dict[str, Any], value: object) -> str:
     """Return the message that Home Assistant publishes for a new value of a component."""
     template = require_module("jinja2").Environment().from_string(part["command_template"])
     return str(template.render(value=value, now=lambda: datetime.now(UTC)))
+
+
+class Meter(Drive):
+    title = "ACME M-1"
+    net_energy = reading(0x0000, "kWh", number_format=NumberFormat.I32)
+    total_energy = reading(0x0002, "kWh", number_format=NumberFormat.U32)
+
+
+def test_only_an_energy_that_cannot_fall_is_declared_as_increasing() -> None:
+    parts = configured(Meter(1), ["net_energy", "total_energy"], [])["cmps"]
+    assert parts["net_energy"]["state_class"] == "total"
+    assert parts["total_energy"]["state_class"] == "total_increasing"
 
 
 # For each platform: the keys that Home Assistant requires, and the optional keys that we use. Source: Home

@@ -13,7 +13,7 @@ from enum import Flag
 from typing import Any
 
 from multidrop import Drive, Register
-from multidrop.drive import Access
+from multidrop.drive import SIGNED, Access
 from multidrop.gateway.live.hub import FAULT, RUNS, STANDS, STATES, digits_of
 
 DISCOVERY = "homeassistant"
@@ -155,10 +155,15 @@ def _sensor(name: str, register: Register[Any]) -> dict[str, Any]:
         found["unit_of_measurement"] = register.unit
         if register.unit in CLASSES:
             found["device_class"] = CLASSES[register.unit]
-        found["state_class"] = "total_increasing" if register.unit == "kWh" else "measurement"
+        found["state_class"] = "measurement" if register.unit != "kWh" else _total(register)
         if (digits := digits_of(register)) is not None:
             found["suggested_display_precision"] = digits
     return found
+
+
+def _total(register: Register[Any]) -> str:
+    """Return the state class of an energy. Home Assistant takes a fall of "total_increasing" for a reset."""
+    return "total" if register.number_format in SIGNED else "total_increasing"
 
 
 def _written(name: str, register: Register[Any], topic: str) -> dict[str, Any]:
