@@ -149,7 +149,9 @@ def test_the_exception_that_ended_a_task_is_logged_with_its_cause(
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_the_gateway_ends_with_its_spools_thread(gateway: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_gateway_ends_when_the_thread_of_its_spool_ends(
+    gateway: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def leave() -> bool:
         raise SystemExit
 

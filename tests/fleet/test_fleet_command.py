@@ -261,7 +261,7 @@ async def test_an_interrupted_stop_reports_that_its_outcome_is_unknown(
 # ---- `fleet demo` shows a takeover, and always removes its processes and files ----
 
 
-async def test_the_demo_waits_until_no_line_moves_between_two_views() -> None:
+async def test_the_demo_waits_until_each_line_keeps_its_master() -> None:
     stage = Stage()
 
     async def look(master: str) -> None:

@@ -137,7 +137,9 @@ async def test_closing_lines_cancels_their_timer(tmp_path: Path, monkeypatch: py
         gateway.mastership.end()
 
 
-async def test_unclosed_lines_keep_timer_and_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_the_kernel_timer_and_the_file_lock_are_kept_if_the_lines_cannot_be_closed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The process could still send, so no other process may believe that it is dead."""
     gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
     gateway.mastership.extend(time.clock_gettime_ns(time.CLOCK_BOOTTIME) + 3600 * 10**9)
@@ -159,7 +161,7 @@ async def test_unclosed_lines_keep_timer_and_lock(tmp_path: Path, monkeypatch: p
 
 
 @pytest.mark.parametrize("part", ["paths", "spool", "log"])
-async def test_a_part_that_fails_to_close_keeps_no_other_part_open(
+async def test_the_gateway_closes_its_other_parts_after_one_part_fails_to_close(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: str
 ) -> None:
     gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)

@@ -228,7 +228,9 @@ def test_only_multidrop_serve_with_a_fleet_accepts_a_plant_without_lines(tmp_pat
         ('[serve.may]\nverbs = ["a.start"]', "[serve.may] lists need lines in this plant file; [fleet.may]"),
     ],
 )
-def test_a_plant_without_lines_has_no_parts_of_lines(tmp_path: Path, more: str, sentence: str) -> None:
+def test_parts_that_need_lines_are_refused_in_a_plant_without_lines(
+    tmp_path: Path, more: str, sentence: str
+) -> None:
     path = tmp_path / "page.toml"
     path.write_text(f"{SERVERS}{more}\n")
     with pytest.raises(PlantError) as raised:
@@ -292,7 +294,7 @@ async def test_the_page_of_a_fleet_sends_stops_and_refuses_other_commands(tmp_pa
 
 
 @pytest.mark.long
-def test_one_gateway_shows_exports_and_stops_a_whole_fleet(tmp_path: Path) -> None:
+def test_one_gateway_can_show_export_and_stop_a_whole_fleet(tmp_path: Path) -> None:
     from secured_clusters import secured_fleet
 
     with secured_fleet(tmp_path / "fleet", 1, GATEWAYS) as fleet, mosquitto(tmp_path) as broker:
@@ -435,7 +437,7 @@ def test_a_gateway_that_does_not_answer_is_shown_without_a_state() -> None:
 
 
 @table("moves", [[{}], [5], "text", None, [MOVE | {"at_ms": "now"}]])
-def test_invalid_moves_in_a_gateways_answer_are_ignored(moves: Any) -> None:
+def test_an_invalid_list_of_moved_lines_in_an_answer_is_ignored(moves: Any) -> None:
     found = looked(view({"gw-1": STATE | {"last_moves": moves}}))
     assert found["gateways"]["gw-1"]["says"] == STATE
 
@@ -459,7 +461,7 @@ def test_a_gateway_whose_session_another_gateway_ended_is_listed_as_missing() ->
             if name != "gw-9" or at == 0:
                 follower.bucket.store(name, record)
     asyncio.run(made.look())
-    clock.pass_s(60)  # a lease later, the view accepts an end that another gateway has written
+    clock.pass_s(60)
     found = looked(made)["missing"]
     assert found.keys() == {name for name, (_, is_missing) in died.items() if is_missing}
     assert found["gw-4"] == {"host": "pc", "session": 2, "seen_ms": now_ms - 60_000}

@@ -67,7 +67,9 @@ def machine_drill(tmp_path_factory: pytest.TempPathFactory) -> Iterator[MachineD
         yield found
 
 
-def test_lines_of_a_dead_machine_move_without_waiting_for_an_election(machine_drill: MachineDrill) -> None:
+def test_the_lines_of_a_dead_machine_get_new_masters_without_an_election(
+    machine_drill: MachineDrill,
+) -> None:
     """The drill has waited until other machines lead the ownership buckets of the dead gateway's lines."""
     machine_drill.settle()
     before = machine_drill.status()["lines"]

@@ -84,7 +84,7 @@ class Model:
     needed: int = NEEDED
     has_cas: bool = True
     gives_up_first: bool = True  # a session counts the line as lost before it sends the line's release
-    looks_home: bool = True  # a session reads the line's first bucket before it writes in another one
+    looks_home: bool = True  # a session reads the record in the line's first bucket before it writes others
     minds_two_votes: bool = True
     minds_who_lives: bool = True
 
@@ -250,7 +250,7 @@ MUTATIONS = {
 
 @pytest.mark.slow
 @table("mutation", MUTATIONS)
-def test_each_changed_ownership_rule_gives_two_masters_or_loses_a_line(mutation: str) -> None:
+def test_the_model_finds_a_fault_if_an_ownership_rule_is_changed(mutation: str) -> None:
     _, wrong = MUTATIONS[mutation].search()
     assert wrong is not None
 
@@ -279,7 +279,8 @@ class PathState(NamedTuple):
     renewed: int | None = 0  # age of the newest renewal whose success the holder knows
     # the record that the taker has read: whether it is still the newest, and how long ago it was first read
     seen: tuple[bool, int] | None = None
-    ending: bool | None = None  # the taker's write in flight; True if it would replace the newest revision
+    # a write in flight that ends this record; True if it would replace the newest revision
+    ending: bool | None = None
 
 
 @dataclass(frozen=True)
@@ -296,7 +297,7 @@ class LeaseModel:
     has_cas: bool = True
     has_timer: bool = True
     waits: bool = True
-    listens: bool = True  # during the guard time, the taker only listens
+    listens: bool = True  # the gateway that takes over sends nothing during the guard time
     lateness: int = 0  # delay of the kernel's timer, in ticks
 
     def path_steps(self, path: PathState) -> Iterator[PathState]:
@@ -333,7 +334,7 @@ class LeaseModel:
             return None if age is None else min(age + 1, most)
 
         terms = self.terms
-        oldest = terms.lease + terms.guard // 2 + self.lateness + 1  # greater ages change no decision
+        oldest = terms.lease + terms.guard // 2 + self.lateness + 1  # all greater ages have the same effect
         return path._replace(
             request=older(path.request, oldest),
             ack=older(path.ack, oldest),
@@ -346,7 +347,7 @@ class LeaseModel:
         """Return a representative of all states with the same future."""
         if not self.has_cas:
             return path
-        # if the observed revision was replaced, the taker cannot end the record
+        # a gateway cannot end a record that was renewed after the gateway had read it
         seen = path.seen if path.seen and path.seen[0] else None
         request = path.request if path.ended is None else None
         return path._replace(seen=seen, request=request, ending=path.ending or None)
@@ -392,7 +393,7 @@ class LeaseModel:
         if not self.is_killed(table, later):
             yield (has_looked, *later)
         if has_looked:
-            yield (False, *numbers)  # the holder has sent its write
+            yield (False, *numbers)  # the holder sends a request to a drive
         elif lease_rules.may_send(0, table.deadline(numbers)):
             yield (True, *numbers)
         for place, number in enumerate(numbers):
@@ -473,12 +474,12 @@ LARGE = ("deadline from the acknowledgement", "guard shorter than the timer's la
     "mutation",
     [pytest.param(name, marks=pytest.mark.long if name in LARGE else ()) for name in LEASE_MUTATIONS],
 )
-def test_each_changed_lease_rule_allows_two_masters(mutation: str) -> None:
+def test_the_model_finds_two_masters_if_a_lease_rule_is_changed(mutation: str) -> None:
     _, wrong = LEASE_MUTATIONS[mutation].search(most=500_000)
     assert wrong is not None
 
 
-def test_the_lease_terms_in_use_have_the_properties_of_the_model() -> None:
+def test_the_default_lease_terms_allow_only_one_master() -> None:
     """Two quorums always share a lease record, and the kernel kills the holder before the guard time ends."""
     terms = Terms()
     assert terms.needed + terms.ended > lease_rules.PATHS

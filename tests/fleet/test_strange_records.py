@@ -110,7 +110,7 @@ async def test_a_lease_record_written_by_another_gateway_ends_the_session(one: C
     async with connected_path(one) as path:
         own, rogue = (LeaseBucket("lease_0", lambda: path, name) for name in ("gw-1", "gw-2"))
         revision = await own.put("gw-1", {**LEASE, "by": "me"}, 0)
-        assert (await rogue.get("gw-1")).value == LEASE  # without "by", as a gateway writes its own record
+        assert (await rogue.get("gw-1")).value == LEASE  # the bucket ignores the writer's "by"
         await rogue.put("gw-1", {**LEASE, "session": 8, "ended": False}, revision)
         ended = {**LEASE, "session": 8, "ended": True, "by": "gw-2"}
         assert (await own.get("gw-1")).value == ended
@@ -154,7 +154,9 @@ async def test_a_gateway_survives_invalid_records(one: Cluster, monkeypatch: pyt
 
 
 @pytest.mark.long
-async def test_a_sessions_end_written_early_by_another_gateway_counts_after_the_lease(one: Cluster) -> None:
+async def test_a_session_ended_early_by_another_gateway_is_polled_until_its_lease_expires(
+    one: Cluster,
+) -> None:
     """The gateway's process may hang. Its engine then continues to poll until the lease expires."""
     async with connected_path(one) as path:
         await store(Bucket(names.PLANT, lambda: path), {"line-1": LINE})

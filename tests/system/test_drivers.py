@@ -241,7 +241,7 @@ SIGNALS = [*((kind, signal.SIGINT) for kind in KINDS), *((kind, signal.SIGTERM) 
 @pytest.mark.long
 @USB
 def test_closing_a_stalled_port_discards_the_start_that_it_holds(guest: Guest, kind: str) -> None:
-    """This driver would wait for the stalled adapter for ever. `close` waits once, for less than a second."""
+    """The driver of this adapter would wait for ever. `close` waits once, for less than a second."""
     found = guest.run("start_in_stall", kind=kind)
     assert len(found["waits"]) <= 1
     assert sum(found["waits"]) < 1
@@ -251,8 +251,8 @@ def test_closing_a_stalled_port_discards_the_start_that_it_holds(guest: Guest, k
 @pytest.mark.slow
 @pytest.mark.long
 @pytest.mark.parametrize(("kind", "number"), SIGNALS)
-def test_a_signal_ends_a_poll_although_its_adapter_is_stalled(guest: Guest, kind: str, number: int) -> None:
-    """This driver would wait for the stalled adapter for ever. The poll waits once, and reports the wait."""
+def test_a_signal_ends_a_poll_while_its_adapter_is_stalled(guest: Guest, kind: str, number: int) -> None:
+    """The driver of this adapter would wait for ever. The poll waits once, and reports the wait."""
     found = guest.run("end_of_stalled_poll", kind=kind, signals=[number])
     assert found["status"] == 0
     assert found["output"].count("waiting 0.75 s for its adapter") <= 1

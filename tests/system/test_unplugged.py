@@ -55,7 +55,7 @@ def test_adapters_that_exchange_their_tty_names_are_distinguished(guest: Guest, 
     found = guest.run("changed_names", how=names)
     assert found["names after"] == found["names"][::-1]
     assert found["wrong"] == []
-    if names != "by_path":  # with by_path, requests go to the USB socket, which now has the other adapter
+    if names != "by_path":  # a name in by_path means the USB socket, which has the other adapter now
         assert found["requests to the other"] == [0, 0]
     assert found["came back"] == (names != "path")  # a port named by its device path stays lost
 
@@ -118,7 +118,7 @@ def test_a_reset_adapter_is_polled_again(guest: Guest, kind: str, names: str) ->
 
 
 @pytest.mark.long
-def test_a_start_during_a_reset_is_sent_at_most_once(guest: Guest) -> None:
+def test_a_start_is_sent_at_most_once_if_its_adapter_is_reset_meanwhile(guest: Guest) -> None:
     delays = [0.0, 0.01, 0.02, 0.03, 0.05, 0.1, 0.2, 1.0]  # a busy computer needs long for a start
     facts = guest.run("reset_in_start", kind="ftdi", delays=delays)
     for fact in facts:

@@ -69,9 +69,9 @@ class FollowedRows:
 
 
 class NameCodes:
-    """Numbers names in the order of their first use.
+    """Gives each name a number, in the order of first use.
 
-    After `most` names, each new name gets the number of the name `rest`.
+    After `most` different names, all new names share one number: that of the name `rest`.
     """
 
     def __init__(self, most: int, rest: str, *names: str) -> None:
@@ -94,7 +94,7 @@ class RowReader:
         # pairs of drive and register to read; samples of other pairs are ignored
         self.known: Container[tuple[str, str]] = ()
         self._clocks = clocks
-        # further names are counted as "", a name that the gateway ignores
+        # names beyond MOST_NAMES become "", a name that the gateway ignores
         self._drives, self._registers = NameCodes(MOST_NAMES, ""), NameCodes(MOST_NAMES, "")
         self._statuses = NameCodes(MOST_STATUSES, OTHER, "ok")
         self._newest: dict[tuple[str, str], int] = {}  # time of the newest sample, by drive and register

@@ -43,7 +43,10 @@ class FleetView:
         self._is_checked = True
 
     async def look(self) -> None:
-        """Read the records and ask the gateways. Raises FleetError if no server returns the records."""
+        """Read the fleet's records, and ask each gateway for its state.
+
+        Raises FleetError if no server returns the records.
+        """
         if not self._path.is_open:
             raise FleetError(f"no NATS server can be reached at {', '.join(self._path.urls)}")
         if not self._is_checked:
@@ -53,7 +56,7 @@ class FleetView:
         said = await asyncio.gather(*map(self._ask, present))
         self._says = dict(zip(present, said, strict=True))
         for state in filter(None, said):
-            with suppress(KeyError, TypeError, ValueError):  # raised if a gateway has sent invalid moves
+            with suppress(KeyError, TypeError, ValueError):  # the gateway's list of moved lines is invalid
                 self._records.moves.add(map(move_of, state.pop("last_moves")))
 
     async def _ask(self, gateway: str) -> dict[str, Any] | None:

@@ -66,8 +66,8 @@ Settings = FleetSettings
 class FleetPart:
     """The part `fleet`, which reads a fleet's state once a second.
 
-    `command` returns a new client for commands, which is not connected yet. It is None if this page may not
-    stop the fleet.
+    `command` is a function that returns a new client for commands, not connected yet. Without such a function
+    (None), the web page cannot stop the fleet.
     """
 
     def __init__(
@@ -89,7 +89,7 @@ class FleetPart:
         return self._command is not None
 
     def take(self, batch: object) -> None:
-        """Ignore the batch of samples: it is from the gateway's own lines, or from `source`."""
+        """Ignore a batch of samples, because this part shows only the state of the fleet."""
 
     async def run(self) -> None:
         works = [self._path.keep(), self._watch.run()]

@@ -202,7 +202,9 @@ def test_a_command_is_not_sent_if_its_line_moves_after_the_offer(
     tell(story)
 
 
-def test_copies_of_a_confirmation_carry_out_the_command_once(tell: Callable[[Story], None]) -> None:
+def test_a_command_is_carried_out_once_although_its_confirmation_is_repeated(
+    tell: Callable[[Story], None],
+) -> None:
     async def story(fleet: Fleet) -> None:
         await fleet.one.open()
         offered = await fleet.offered()

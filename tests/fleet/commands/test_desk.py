@@ -219,7 +219,7 @@ async def test_a_new_master_accepts_stops_but_no_commands_during_the_guard_time(
     assert desk.written == {"control"}
 
 
-async def test_a_request_for_the_result_withdraws_an_unconfirmed_offer(desk: Desks) -> None:
+async def test_an_unconfirmed_command_is_cancelled_when_its_result_is_requested(desk: Desks) -> None:
     token = desk.offered()
     assert (await desk.desk.do(json.dumps({"ask": token}).encode())).outcome is NOT_SENT
     assert (await desk.do(token)).outcome is NOT_SENT
@@ -498,8 +498,8 @@ def test_a_command_to_a_drive_that_has_left_its_line_is_not_sent() -> None:
         assert answer.text.startswith("mill is ")
 
 
-def test_an_offer_does_not_change_the_known_setpoint() -> None:
-    """The command of an offer may never be sent. A changed setpoint would affect the next start."""
+def test_the_check_of_a_command_does_not_change_the_known_setpoint() -> None:
+    """A checked command may never be sent. A changed setpoint would affect the next start."""
     drive = InvtCHE(1, name="mill", maximum_frequency=50)
     drive.commanded = 40.0
     prepare(drive, CommandRequest("1", "anna", "mill", verb="set_frequency", options={"hz": 10.0}))
@@ -507,7 +507,7 @@ def test_an_offer_does_not_change_the_known_setpoint() -> None:
 
 
 @pytest.mark.long
-async def test_a_joined_stop_cancels_offered_commands_immediately(
+async def test_a_stop_that_waits_for_an_equal_stop_cancels_offered_commands_immediately(
     desk: Desks, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     begun, silent = list[str](), asyncio.Event()
@@ -585,7 +585,9 @@ async def test_log_records_keep_their_order_and_are_refused_after_the_close(tmp_
     assert [line.partition('"step": ')[2] for line in lines] == ["0}", "1}", "2}", "3}", "4}"]
 
 
-async def test_few_records_wait_for_a_hanging_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_command_log_refuses_records_if_too_many_wait_for_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     disk, log = threading.Event(), CommandLog(tmp_path / "commands.jsonl")
     monkeypatch.setattr(log_module, "MOST_WAITING", 2)
     with patch.object(CommandLog, "_add", lambda *record: disk.wait()):

@@ -395,7 +395,7 @@ def test_commands_are_sent_with_an_older_copy_of_the_plant(tmp_path: Path) -> No
     assert asked(tmp_path, path, stop, plant).outcome is DONE
 
 
-def test_a_stop_of_a_named_line_needs_no_plant(tmp_path: Path) -> None:
+def test_a_stop_of_a_named_line_is_sent_although_the_plant_cannot_be_read(tmp_path: Path) -> None:
     path = ScriptedPath(stop=[IT_IS_DONE])
     plant = Plant(FleetError("no server"))
     told = asked(tmp_path, path, lambda client: client.stop(["pump-1"], line="hall-1"), plant)

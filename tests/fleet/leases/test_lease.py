@@ -75,7 +75,7 @@ async def watched() -> tuple[Trial, Lease, Observer]:
     return trial, lease, observer
 
 
-async def test_a_session_starts_in_all_buckets_and_its_lease_counts_from_the_request() -> None:
+async def test_a_new_lease_lasts_from_the_request_and_not_from_the_answer() -> None:
     trial = Trial()
     for bucket in trial.buckets:
         bucket.before_put = lambda key: trial.clock.pass_s(0.25)  # the request takes 0.25 s
@@ -97,15 +97,15 @@ async def test_a_renewed_lease_counts_from_the_request_not_from_the_answer() -> 
     assert lease.until == trial.masterships[0].until == sent + USUAL.lease
 
 
-async def test_a_lease_record_with_an_unanswered_start_counts_once_it_is_renewed() -> None:
-    """The answer was lost, so the lease does not know which of its requests wrote the lease record."""
+async def test_a_record_without_an_answer_extends_the_lease_after_its_next_renewal() -> None:
+    """The answer to a request was lost, so the lease does not know which request wrote the lease record."""
     trial = Trial()
     trial.buckets[2].loses_answers = True
     lease, began = trial.lease(), trial.clock.now
     assert await lease.try_to_begin()
     trial.buckets[2].loses_answers = False
     trial.clock.pass_s(1)
-    await lease.renew_once(2)  # reads the lease record, which the unanswered start has stored
+    await lease.renew_once(2)  # reads the record that the unanswered request has stored
     assert lease.held[2] is not None
     trial.clock.pass_s(0.5)
     await lease.renew_once(1)
@@ -210,7 +210,7 @@ async def test_a_session_ends_even_if_its_last_renewal_is_stored_late() -> None:
 
 
 @pytest.mark.parametrize("later", [{"nonce": "another's"}, {"ended": True, "by": "b"}])
-async def test_the_record_that_ends_a_session_replaces_only_its_own_renewals(later: dict[str, Any]) -> None:
+async def test_the_end_of_a_session_replaces_only_records_of_that_session(later: dict[str, Any]) -> None:
     trial, lease = await begun()
     trial.buckets[0].store("a", {**trial.values()[0], **later})
     await lease.end()
@@ -557,7 +557,7 @@ async def test_a_session_that_is_over_stays_over_after_an_outage() -> None:
     assert observer.sessions().keys() == {"a"}
 
 
-async def test_a_sessions_end_written_during_an_outage_counts_after_a_lease() -> None:
+async def test_an_observer_doubts_the_end_of_a_session_that_was_written_during_an_outage() -> None:
     """The gateway may have renewed its session, unseen, right before another gateway wrote the end."""
     trial, _lease, observer = await watched()
     await observer.end_the_dead()
@@ -622,7 +622,7 @@ async def test_an_observer_without_answers_counts_no_gateway_as_dead() -> None:
     assert observer.dead().keys() == {"a"}
 
 
-async def test_a_sessions_end_written_by_another_gateway_counts_after_the_lease() -> None:
+async def test_a_session_ended_by_another_gateway_is_over_when_its_lease_expires() -> None:
     """The end may be wrong: until the lease expires, the session's own gateway may still send."""
     trial = Trial()
     lease, observer, late = trial.lease(), trial.observer(), trial.observer("c")
@@ -635,7 +635,7 @@ async def test_a_sessions_end_written_by_another_gateway_counts_after_the_lease(
     assert lease.is_valid
     assert not observer.is_over("a", 1)
     assert not observer.is_over("a", 9)
-    # a lease has passed since the observer saw the last renewal
+    # the lease expires now, counted from when the observer saw the last renewal
     trial.clock.pass_s(USUAL.lease / SECOND - 1.0)
     assert observer.is_over("a", 1)
     assert observer.sessions() == {}
@@ -644,7 +644,7 @@ async def test_a_sessions_end_written_by_another_gateway_counts_after_the_lease(
     assert late.is_over("a", 1)
 
 
-async def test_a_session_that_its_own_gateway_has_ended_is_over_immediately() -> None:
+async def test_a_session_is_over_immediately_if_its_own_gateway_ends_it() -> None:
     trial, lease, observer = await watched()
     await lease.end()
     await look(observer)
@@ -686,7 +686,7 @@ async def test_an_ended_lease_record_stays_ended_for_the_rest_of_its_session() -
     assert lease.is_valid
 
 
-async def test_a_session_with_an_ended_lease_record_is_weak_until_the_next_session() -> None:
+async def test_a_session_with_only_two_valid_lease_records_is_reported_as_weak() -> None:
     trial, lease, observer = await watched()
     assert (lease.is_weak, observer.weak()) == (False, [])
     trial.buckets[1].store("a", {**trial.values()[1], "ended": True, "by": "b"})
@@ -718,7 +718,7 @@ async def test_a_session_later_writes_the_lease_record_in_a_bucket_that_was_down
     assert lease.held[2] is not None
 
 
-async def test_a_session_replaces_the_lease_record_of_a_dead_session_of_its_number() -> None:
+async def test_a_session_replaces_a_record_of_a_dead_session_with_the_same_number() -> None:
     """Another process of this gateway left the record, and died before it had written a second record."""
     trial = Trial()
     trial.buckets[2].is_down = True
@@ -731,7 +731,7 @@ async def test_a_session_replaces_the_lease_record_of_a_dead_session_of_its_numb
     assert trial.values()[2]["nonce"] == trial.values()[0]["nonce"]
 
 
-async def test_a_session_is_weak_if_its_lease_record_in_a_late_bucket_was_ended() -> None:
+async def test_a_session_is_weak_if_a_record_was_ended_before_its_write_was_confirmed() -> None:
     trial = Trial()
     trial.buckets[2].loses_answers = True
     lease = trial.lease()

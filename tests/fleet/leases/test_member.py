@@ -233,7 +233,7 @@ async def test_a_drained_gateway_releases_all_lines_and_claims_none(fleet: Clust
 
 @pytest.mark.slow
 @pytest.mark.long
-async def test_with_a_silent_server_only_a_drain_releases(
+async def test_only_a_drained_gateway_releases_lines_while_a_server_is_silent(
     fleet: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     silent = Replica("n3", is_current=False, is_offline=True, active_ns=0)
@@ -458,7 +458,7 @@ def test_a_killed_incompatible_gateway_is_ignored_once_its_lease_has_expired(tri
     assert trial.trouble == ""
 
 
-def test_a_gateways_own_earlier_session_is_never_incompatible(trial: Trial) -> None:
+def test_an_earlier_session_of_the_same_gateway_is_not_reported_as_incompatible(trial: Trial) -> None:
     trial.begin("me", RULES - 1)
     assert trial.trouble == ""
 

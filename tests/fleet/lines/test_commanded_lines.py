@@ -350,7 +350,9 @@ def test_a_request_abandoned_when_polling_ends_has_a_row_with_that_status(
         ((1, 2, 2, 3), 3, Verdict(doubled=1)),
     ],
 )
-def test_judge_drive_counts_replies(numbers: Sequence[int | None], answered: int, expected: Verdict) -> None:
+def test_lost_late_and_doubled_replies_are_counted(
+    numbers: Sequence[int | None], answered: int, expected: Verdict
+) -> None:
     assert judge_drive(numbers, answered) == expected
 
 

@@ -134,7 +134,7 @@ class DeadTrial(Trial):
         await asyncio.wait_for(self.is_polled(), 10)
 
 
-async def test_a_new_master_accepts_stops_immediately_and_commands_after_the_guard() -> None:
+async def test_a_new_master_accepts_stops_immediately_but_commands_after_the_guard_time() -> None:
     trial = await claimed()
     assert trial.lines.taken == {"hall"}
 
@@ -207,7 +207,7 @@ async def test_a_line_lost_while_waiting_to_be_opened_is_not_opened() -> None:
     assert trial.lines.taken == set()
 
 
-async def test_a_closed_line_accepts_no_stops() -> None:
+async def test_a_line_accepts_no_stops_after_it_was_closed_for_its_release() -> None:
     trial = await claimed()
     trial.keeper.releasing = {"hall"}
     await trial.reconcile()
@@ -279,7 +279,9 @@ async def test_a_bucket_without_a_leader_does_not_delay_a_claim(place: int) -> N
     assert owners(trial).count(ME) == 2
 
 
-async def test_a_slow_bucket_does_not_delay_a_claim(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_line_is_claimed_although_one_of_its_buckets_answers_late(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(line_keeper, "SPARE_S", 0.0)
     trial = DeadTrial()
     await trial.claim_without_the_first()
@@ -317,7 +319,7 @@ async def test_a_bucket_whose_home_server_may_have_failed_is_written_last() -> N
     assert owners(trial) == [NOBODY, ME, ME]
 
 
-async def test_if_all_lease_records_are_renewed_late_buckets_keep_their_order() -> None:
+async def test_buckets_are_written_in_the_usual_order_if_all_renewals_are_late() -> None:
     """If all records are renewed late, the servers are busy, and no single home server has failed."""
     trial = DeadTrial()
     await trial.read_and_begin()
@@ -328,8 +330,10 @@ async def test_if_all_lease_records_are_renewed_late_buckets_keep_their_order() 
     assert owners(trial) == [ME, ME, NOBODY]
 
 
-async def test_a_claim_does_not_wait_for_a_failed_home_server(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The gateway must write a new line's first record in this bucket. It cannot use another bucket."""
+async def test_a_claim_ends_although_the_server_of_its_bucket_has_failed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The first record of a new line must be in this bucket. Its server does not answer."""
     monkeypatch.setattr(line_keeper, "SPARE_S", 0.0)
     trial = Trial()
     await trial.read_and_begin()

@@ -155,8 +155,8 @@ def test_a_gateway_owns_a_line_only_with_two_votes_in_its_records() -> None:
     assert owner_by_records(LIVING, NEVER, NEVER) is None
 
 
-def test_if_two_owners_have_two_votes_each_the_newer_one_is_shown() -> None:
-    """The first record still has two votes for a dead session: its bucket had no leader for a while."""
+def test_the_newer_owner_is_shown_if_two_owners_have_two_votes_each() -> None:
+    """A dead session has two votes in one old record: its bucket had no leader for a while."""
     records = records_of(DEAD, ME, ME, alone=True)
     for bucket in ("second", "third"):
         records[bucket] = Record("x", 20, owner_value(ME, 6, 0))
@@ -257,7 +257,7 @@ def test_no_line_is_released_while_two_buckets_have_a_silent_server(monkeypatch:
     assert trial.releases.due(FIRST_LINES) == FIRST_LINES - {FIRST["own_1"]}
 
 
-def test_lines_are_released_although_a_server_is_silent_for_60_s(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lines_are_released_after_a_server_was_silent_for_60_s(monkeypatch: pytest.MonkeyPatch) -> None:
     trial = Releasing(monkeypatch)
     trial.maimed = {"own_0", "own_1"}
     trial.releases.due(FIRST_LINES)

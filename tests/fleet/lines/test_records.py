@@ -63,7 +63,7 @@ def test_ownership_records_of_free_lines_and_of_own_lines_are_read_once() -> Non
 
 
 @pytest.mark.parametrize("value", [OTHER, owner_value(("a", 1), 1, 0)])
-def test_an_ownership_record_of_another_session_is_read_until_it_is_free(value: Any) -> None:
+def test_an_ownership_record_is_read_again_until_it_names_no_gateway(value: Any) -> None:
     trial = Trial()
     trial.bucket.store("line", value)
     trial.follower.want(["line"])

@@ -121,8 +121,8 @@ def test_a_gateway_that_rejoins_a_running_fleet_gets_its_share_immediately() -> 
     assert trial.is_shared_with("b", "c")
 
 
-def test_at_a_cold_start_lines_are_assigned_once_no_more_gateways_join() -> None:
-    """Assigned earlier, the first gateway would read all lines' records, and the second half of them."""
+def test_a_starting_fleet_assigns_lines_when_no_more_gateways_join() -> None:
+    """Otherwise the first gateway would read the records of all lines, and the second one half of them."""
     trial = Trial()
     assert trial.shared_among("b") == set()
     trial.clock.pass_s(QUIET_NS / SECOND - 0.01)
@@ -209,7 +209,7 @@ def test_a_line_with_a_lost_port_is_reported_after_6_s(silent_s: float | None, n
     assert lost_after(0.1)
 
 
-def test_one_reported_line_is_tried_at_a_time_with_increasing_pauses() -> None:
+def test_unopened_lines_are_tried_one_after_another_with_increasing_pauses() -> None:
     clock, unopened = reported(*"abc")
     wait_s = FIRST_WAIT_NS / SECOND
     for line in "abcab":
@@ -234,7 +234,7 @@ def test_lines_reported_by_all_gateways_are_tried_first_and_regularly() -> None:
     assert unopened.named() == {"a", "b", "c"}
 
 
-def test_after_a_successful_trial_the_other_reported_lines_are_tried_at_once() -> None:
+def test_the_other_unopened_lines_are_tried_immediately_after_one_was_opened() -> None:
     clock, unopened = reported(*"abc")
     clock.pass_s(FIRST_WAIT_NS / SECOND)
     for line, left in (("a", {"b", "c"}), ("b", {"c"}), ("c", set[str]())):
@@ -242,7 +242,7 @@ def test_after_a_successful_trial_the_other_reported_lines_are_tried_at_once() -
         unopened.opened(line)
 
 
-def test_a_gateway_tries_its_own_reported_lines_first() -> None:
+def test_a_gateway_first_tries_unopened_lines_of_its_own_share() -> None:
     """If it tried a line that is assigned to another gateway, it would not get the line back."""
     clock, unopened = reported(*"abcd")
     unopened.home = frozenset("bd")
@@ -254,7 +254,7 @@ def test_a_gateway_tries_its_own_reported_lines_first() -> None:
     assert unopened.named() == frozenset()
 
 
-def test_a_trial_of_a_reported_line_ends_if_the_line_does_not_come_back() -> None:
+def test_the_trial_of_an_unopened_line_ends_if_the_line_is_not_assigned_again() -> None:
     clock, unopened = reported("a", "b")
     clock.pass_s(FIRST_WAIT_NS / SECOND)
     assert unopened.named() == {"b"}
@@ -262,7 +262,7 @@ def test_a_trial_of_a_reported_line_ends_if_the_line_does_not_come_back() -> Non
     assert unopened.named() == frozenset()
 
 
-def test_only_lines_that_fit_into_a_lease_record_are_reported() -> None:
+def test_the_names_of_reported_lines_are_limited_to_8_kb() -> None:
     _, unopened = reported(*(f"line-{number}" for number in range(MOST_BYTES // 8)))
     assert 0 < sum(len(line) + 4 for line in unopened.named()) <= MOST_BYTES
 
@@ -288,7 +288,7 @@ def test_a_reported_line_moves_to_a_gateway_that_has_not_reported_it() -> None:
     assert {found[line] for line in OF_A} == {"c"}
 
 
-def test_a_gateway_without_a_list_of_unopened_lines_gets_no_reported_lines() -> None:
+def test_a_gateway_that_sends_no_list_of_unopened_lines_takes_none_from_others() -> None:
     """A gateway of another version reports no list, and would not take lines that others could not open."""
     assert hand_over(SHARED, {"a": OF_A}) == SHARED
     assert set(hand_over(SHARED, {"a": OF_A, "c": []}).values()) == {"b", "c"}

@@ -414,7 +414,7 @@ def test_a_second_hub_of_a_database_waits_until_the_first_ends(empty: Postgres) 
     with pytest.raises(SinkError, match="another hub writes into this database; waiting until it ends"):
         other.begin("then")
     one.write(commit_of())
-    assert one.begin("then") == StoredPosition(1, {"a.x": 1})  # the stored position, as after a failure
+    assert one.begin("then") == StoredPosition(1, {"a.x": 1})  # a hub asks again after a failure
     one.close()
     assert other.begin("then") == StoredPosition(1, {"a.x": 1})
     with pytest.raises(

@@ -370,7 +370,7 @@ def test_the_check_after_random_kills_finds_lost_and_duplicated_rows(chaos: Any)
     assert chaos.compare(told, doubled) == (9, 0, 0, 1)
 
 
-def test_the_check_after_random_kills_finds_the_hubs_alarms(
+def test_alarms_in_the_log_of_a_hub_are_found_after_random_kills(
     chaos: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     check = SourceCheck({})

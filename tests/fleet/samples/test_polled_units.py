@@ -120,7 +120,7 @@ def test_merged_files_keep_units_even_if_some_rows_have_no_unit(tmp_path: Path) 
     assert {found[at] for at in range(52, 90, 4)} == {"A"}
 
 
-def test_a_gateway_names_units_as_a_history_does() -> None:
+def test_a_unit_has_the_same_name_in_a_gateway_and_in_a_history() -> None:
     plant = {"drives": {"a": {"model": "meter.toml", "registers": {"b": {"values": {"ON": 1}}}}}}
     assert quantities.units_of(plant) == {("a", "b"): "names of meter.toml"}
     assert RAW == quantities.RAW

@@ -95,11 +95,13 @@ def test_headers_of_the_server_take_precedence_over_headers_of_the_writer(writer
         b"NATS/1.0\r\nNats-Subject: a\r\nNats-Sequence: -1\r\n\r\n",
     ],
 )
-def test_headers_that_belong_to_no_stored_message_end_an_answer(headers: bytes) -> None:
+def test_a_message_without_a_valid_subject_and_sequence_is_no_stored_message(headers: bytes) -> None:
     assert stored_message(headers, b"") is None
 
 
-async def test_a_record_that_imitates_an_answers_end_hides_no_record(one: Cluster, way: str) -> None:
+async def test_an_answer_is_complete_although_a_record_imitates_the_end_of_answers(
+    one: Cluster, way: str
+) -> None:
     async with connected_path(one) as path:
         bucket = Bucket("own_0", lambda: path)
         await bucket.put(f"{way}-a", OWNER, 0)
@@ -118,7 +120,7 @@ async def test_a_record_that_imitates_an_answers_end_hides_no_record(one: Cluste
         assert keys == [f"{way}-a", f"{way}-b", f"{way}-c"]
 
 
-async def test_each_record_of_a_batch_is_replaced_only_at_its_revision(one: Cluster, way: str) -> None:
+async def test_a_batch_replaces_only_records_that_have_the_expected_revision(one: Cluster, way: str) -> None:
     async with connected_path(one) as path:
         bucket = Bucket("own_1", lambda: path)
         a, b, c = f"{way}-a", f"{way}-b", f"{way}-c"
@@ -231,7 +233,7 @@ async def test_a_late_answer_is_not_taken_for_another_request(one: Cluster) -> N
         await one_of.close()
 
 
-async def test_a_pong_after_the_flushs_timeout_does_not_end_reading(one: Cluster) -> None:
+async def test_a_client_continues_to_read_after_a_late_pong(one: Cluster) -> None:
     client = await connect(one.urls[0], {})
     given_up = asyncio.get_running_loop().create_future()
     given_up.cancel()  # as when a flush times out

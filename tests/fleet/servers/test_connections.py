@@ -301,7 +301,7 @@ async def test_a_server_is_silent_after_two_seconds(servers: Servers, unheard_ns
     assert (servers.terms[names.LEASES[0]] > 1) is is_due
 
 
-async def test_raft_terms_grow_faster_than_a_silent_server_starts_elections(servers: Servers) -> None:
+async def test_leaders_change_more_often_than_a_silent_server_starts_elections(servers: Servers) -> None:
     servers.silent = {"n3"}
     for second in range(60):
         await servers.pass_s(1)
@@ -312,7 +312,7 @@ async def test_raft_terms_grow_faster_than_a_silent_server_starts_elections(serv
     assert HAND_OVER_S < ASKS_S
 
 
-async def test_a_bucket_with_a_new_leader_is_handed_over(servers: Servers) -> None:
+async def test_leadership_moves_again_after_an_election_while_a_server_is_silent(servers: Servers) -> None:
     servers.silent = {"n3"}
     servers.leaders[names.LEASES[2]] = "n1"
     await servers.pass_s(1)
@@ -357,7 +357,9 @@ async def test_a_leader_that_does_not_answer_delays_no_hand_over_of_other_bucket
 
 
 @pytest.mark.parametrize("cut_after_s", [0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7])
-async def test_raft_terms_are_newer_before_an_election_starts(cut_after_s: float, servers: Servers) -> None:
+async def test_raft_terms_rise_before_a_cut_off_server_starts_an_election(
+    cut_after_s: float, servers: Servers
+) -> None:
     """Leaders on other servers report the cut-off server as silent after 2 s."""
     keeping = asyncio.create_task(keep_leaders(lambda: PATH, lambda: True, asyncio.get_running_loop().time))
     await asyncio.sleep(10 + cut_after_s)

@@ -58,7 +58,7 @@ def check_that_a_stop_reports_its_progress(fleet: SecuredFleet) -> None:
     assert out.startswith("done: drive-line-1: stopped: seen to stand after "), (out, err)
 
 
-def test_a_whole_fleet_works_with_the_rights_that_fleet_rights_writes(tmp_path: Path) -> None:
+def test_a_whole_fleet_works_with_the_generated_rights(tmp_path: Path) -> None:
     """The steps: cold start, a new gateway, a dead gateway, a drain and the hub. No log reports a denial.
 
     The servers read the new gateway's rights while the other gateways continue. NATS 2.15 gives a new account

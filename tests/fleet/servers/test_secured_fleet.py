@@ -356,7 +356,7 @@ def test_servers_send_no_answer_to_another_users_subject(tmp_path: Path, number:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [1, pytest.param(3, marks=pytest.mark.long)])
-def test_with_one_account_answers_reach_other_users(tmp_path: Path, number: int) -> None:
+def test_answers_reach_other_users_if_all_users_share_one_account(tmp_path: Path, number: int) -> None:
     with secured_cluster(tmp_path, number, TWO_GATEWAYS, in_one_account) as servers:
         wanted = {subject for subjects in foreign(servers).values() for subject in subjects}
         assert asyncio.run(arrivals(servers, wanted)) == wanted

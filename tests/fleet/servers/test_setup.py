@@ -88,7 +88,9 @@ def test_lines_can_be_claimed_while_two_of_three_buckets_have_a_leader(said: byt
 
 
 @pytest.mark.slow
-def test_init_refuses_two_writes_to_one_revision(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_init_refuses_servers_that_accept_two_writes_to_one_revision(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Old servers accept two concurrent writes to one revision. Their version is not checked in this test."""
     monkeypatch.setattr(servers, "OLDEST", (0, 0))
     with cluster(tmp_path, 3, old_server_program()) as old:
@@ -97,7 +99,9 @@ def test_init_refuses_two_writes_to_one_revision(tmp_path: Path, monkeypatch: py
             asyncio.run(initialised(old.urls))
 
 
-def test_init_refuses_servers_that_ignore_a_writer(nats: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_init_refuses_servers_that_accept_the_writes_of_several_gateways(
+    nats: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Such servers would grant a lease to two gateways. Some of their answers may arrive too late."""
     monkeypatch.setattr(LeaseBucket, "_pattern", LeaseBucket._subject)
     with pytest.raises(FleetError, match=r"accepted [2-6] of 6 concurrent writes to the same revision"):
@@ -144,7 +148,7 @@ def test_init_needs_all_servers_only_when_it_creates_buckets(tmp_path: Path) -> 
         while not {f"KV_{name}" for name in names.BUCKETS} <= set().union(*(one.leads() for one in others)):
             assert time.monotonic() < ends
             time.sleep(0.1)
-        # all servers have a copy, so a plant can still be stored
+        # no bucket is missing, so two of three servers are enough
         assert asyncio.run(initialised(three.urls))["replicas"] == 3
 
 
@@ -348,7 +352,7 @@ def as_text(line: Any) -> str:
     )
 
 
-def test_lines_read_from_their_records_equal_those_of_the_plant_file(tmp_path: Path) -> None:
+def test_the_lines_in_stored_records_equal_the_lines_in_the_plant_file(tmp_path: Path) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(PLANT, "utf-8")
     again = lines_again(path, tmp_path / "gateway")

@@ -89,9 +89,10 @@ class CommandDesk:
     # ---- offering a command ----
 
     def offer(self, line: str, data: bytes) -> Offered | CommandAnswer | None:
-        """Check a command message; return an offer, or an answer with the reason for a refusal.
+        """Check the command in a message, and return the offer to carry it out.
 
-        Return None if another gateway is the line's master.
+        If the command must not be sent, return an answer with the reason. Return None if another gateway is
+        the line's master.
         """
         held = self._lines.for_command(line)
         if held is None:
@@ -125,7 +126,7 @@ class CommandDesk:
         elif self.offers.take(offer):
             supervisor().start("command", self._carry_out(offer))
         with suppress(TimeoutError):
-            await asyncio.wait_for(offer.over.wait(), HOLD_S)
+            await asyncio.wait_for(offer.has_ended.wait(), HOLD_S)
         found = offer.answer or CommandAnswer(CommandOutcome.UNDER_WAY, f"{offer.prepared.text}: under way")
         return found._replace(gateway=self.gateway)
 

@@ -82,10 +82,10 @@ def _prepare_write(drive: Drive, request: CommandRequest) -> Prepared:
 
 @dataclass(eq=False)
 class Offer:
-    """An offer to carry out one command on a line that this gateway polls.
+    """A command that a gateway has checked and has offered to carry out.
 
-    `is_taken` becomes True when the sender returns the token. When the command has ended, `answer` and
-    the event `over` are set.
+    The client that sent the command confirms it by sending `token` to the gateway; then `is_taken` becomes
+    True. When the command has ended, `answer` and the event `has_ended` are set.
     """
 
     token: str
@@ -96,7 +96,7 @@ class Offer:
     is_taken: bool = False
     why_void: str = ""
     answer: CommandAnswer | None = None
-    over: asyncio.Event = field(default_factory=asyncio.Event)
+    has_ended: asyncio.Event = field(default_factory=asyncio.Event)
 
     def unsent(self, why: str) -> CommandAnswer:
         """Return the answer for a command that was certainly not sent."""
@@ -148,7 +148,10 @@ class Offers:
         return f"{age_s:.1f} s have passed since the offer, and {LIMIT_NS / SECOND:g} s is allowed"
 
     def void(self, line: str, drives: Collection[str] | None, why: str) -> None:
-        """Cancel the unfinished offers for these drives of a line; None means all drives of the line."""
+        """Cancel the offered commands for these drives of a line, or for all its drives if `drives` is None.
+
+        Commands that have ended keep their result.
+        """
         for offer in self._by_token.values():
             is_one = offer.held.name == line and (drives is None or offer.request.drive in drives)
             if is_one and offer.answer is None:
@@ -164,4 +167,4 @@ class Offers:
     def end(self, offer: Offer, answer: CommandAnswer) -> None:
         """Set the result of an offered command. Copies of its message get this result too."""
         offer.answer = answer
-        offer.over.set()
+        offer.has_ended.set()

@@ -259,9 +259,9 @@ class Lease:
     async def _take_late(self, path: int) -> None:
         """Write the lease record in a bucket that was not available when the session started.
 
-        Replace a record of an earlier session: that session ended when this one replaced its other records.
-        Keep the record while this session has too few records, because another gateway of this name may need
-        it.
+        The bucket may have a record of an earlier session. That record is replaced: the earlier session ended
+        when this session replaced its other two records. Nothing is written while this session has lost too
+        many records itself, because another process of the same name may use the record.
         """
         nonce = self._nonce
         record = await self._read(path)

@@ -51,7 +51,8 @@ SETTLE_S = 3.0
 # If less is left, the servers may be failing for all gateways.
 SOUND_S = 1.0
 WEAK_LOOK_S = 1.0
-# A session that has lost one of its three lease records is kept for at least this time after STARTING.
+# A session that has lost one of its three lease records is replaced by a new session. But it is kept for at
+# least this time after the gateway's state was STARTING.
 WEAK_NS = 10 * SECOND
 
 
@@ -293,7 +294,10 @@ class Member:
                 self._is_too_weak = await have_leaders(self.best()) and await lease.could_be_whole()
 
     def _keeps_leaders(self) -> bool:
-        """Return True if this gateway manages the buckets' leaders: the first living gateway by name does."""
+        """Return True if this gateway manages the buckets' leaders.
+
+        Of all living gateways, the one whose name is first in the alphabet does this.
+        """
         return self.lease.is_valid and min(self.records.observer.sessions(), default="") == self.name
 
     # ---- one step ----
@@ -301,7 +305,7 @@ class Member:
     async def step(self) -> None:
         """Take one step of the state machine.
 
-        It waits for servers only to end the sessions of dead gateways.
+        A step waits for the servers in one case only: when it ends the session of a dead gateway.
         """
         observer = self.records.observer
         present = observer.sessions()

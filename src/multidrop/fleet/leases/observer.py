@@ -44,7 +44,8 @@ class Observer:
         self.ended = 0  # number of sessions that this process ended
         self._watched: list[dict[str, SeenRevision]] = [{} for _ in buckets]
         self._looked = [0] * len(self.paths)  # start of the newest read that was answered, by bucket (ns)
-        self._over: dict[str, int] = {}  # by gateway: its highest session number that is certainly over
+        # number of the newest session that is known to be over, by gateway
+        self._over: dict[str, int] = {}
         self._clock = clock
 
     def restart_waits(self) -> None:
@@ -174,7 +175,7 @@ class Observer:
                 and not record.value["ended"]
                 and self._is_stale(path, record, self._looked[path])
             }
-            if lease_rules.is_over(len(stale), self.terms):  # with fewer stale records, the gateway is alive
+            if lease_rules.is_over(len(stale), self.terms):  # enough records to end the session
                 found[name] = stale
         return found
 
@@ -210,7 +211,8 @@ class Observer:
     async def _end_enough(self, records: Mapping[int, Record]) -> bool:
         """End these lease records concurrently; return True if this call has ended one.
 
-        Wait only for as many answers as a session's end needs, because a bucket without a leader gives none.
+        A session is over once two of its three records are ended. So wait for two answers, not for the third:
+        a bucket without a leader never answers.
         """
         ends = [asyncio.create_task(self._end(path, record)) for path, record in records.items()]
         answers: list[bool] = []

@@ -45,10 +45,11 @@ TAKE_AGAIN_S = 2.0  # pause between attempts to open a line
 WRITTEN_AT_ONCE = 64
 LINES_AT_ONCE = 32  # limit of lines that are opened or closed concurrently
 WRITERS = 2  # limit of concurrent batches of writes in each bucket
-# Two renewal periods. If the last renewal of a lease record is this much older than those of the other two,
-# the servers of its bucket may have no leader.
+# A gateway renews its lease in three buckets. If the newest renewal in one bucket is this much older than
+# those in the other two, the bucket's server may have failed. The time is two renewal periods.
 LAG_NS = SECOND
-# after this time without enough stored records, a claim also writes the spare ownership record
+# To claim a line, a gateway writes two of the line's three ownership records. If the servers have not
+# confirmed both after this time, it also writes the third one.
 SPARE_S = 0.15
 
 
@@ -310,8 +311,9 @@ class OwnerRecords:
         self._records = records
         self._may_write = may_write
         self._on_mine = on_mine
-        # by line and bucket: revision of the record that the latest release replaces
-        self._offered: dict[tuple[str, str], int] = {}
+        # When this gateway releases a line, it replaces the line's record in each bucket. This is the
+        # revision of the replaced record, by line and bucket.
+        self._released: dict[tuple[str, str], int] = {}
         self._writing = {bucket: asyncio.Semaphore(WRITERS) for bucket in names.OWNERS}
 
     @property
@@ -325,7 +327,7 @@ class OwnerRecords:
         """
         me, votes = self._me, 0
         for bucket, record in self._records.of(line).items():
-            if owner_of(record) == me and record and self._offered.get((line, bucket)) != record.revision:
+            if owner_of(record) == me and record and self._released.get((line, bucket)) != record.revision:
                 votes += record.value["votes"]
         return votes >= NEEDED
 
@@ -334,7 +336,7 @@ class OwnerRecords:
         return {
             bucket
             for bucket, record in self._records.of(line).items()
-            if record and self._offered.get((line, bucket)) == record.revision
+            if record and self._released.get((line, bucket)) == record.revision
         }
 
     def _naming_us(self, line: str) -> dict[str, Record]:
@@ -356,15 +358,16 @@ class OwnerRecords:
 
     def _leaderless(self) -> set[str]:
         """Return the ownership buckets whose NATS server seems to have failed."""
-        # a failed server also ends the renewals in its lease bucket
+        # the lease bucket and the ownership bucket of the same number have the same home server
         sent = [path.sent if path else 0 for path in self._lease.held]
         since = sorted(sent)[1] - LAG_NS
         return {bucket for bucket, moment in zip(names.OWNERS, sent, strict=True) if moment < since}
 
     async def claim(self, claims: Mapping[str, Claim]) -> None:
-        """Write the `first` records of these claims, and also the `spare` records if a bucket answers late.
+        """Claim lines: write the records in `Claim.first`, and if a bucket answers late, also `Claim.spare`.
 
-        After a refusal, do not wait for further answers: the claim is repeated soon with newer records.
+        If the server of a bucket refuses a record, do not wait for other buckets: the line is claimed again
+        soon, with newer records.
         """
         now_ms, begun = time.time_ns() // 1_000_000, time.monotonic()
         values = {
@@ -402,7 +405,7 @@ class OwnerRecords:
     ) -> set[asyncio.Task[set[str]]]:
         """Wait until each line is claimed or its claim refused, for at most `within_s`.
 
-        Return the unanswered writes. Add the lines of refused writes to `refused`.
+        Return the unanswered writes. Add each line whose record was refused to `refused`.
         """
         late = set(writes)
         with suppress(TimeoutError):
@@ -423,14 +426,17 @@ class OwnerRecords:
         for line in lines:
             ours = self._naming_us(line)
             for bucket, record in ours.items():
-                self._offered[line, bucket] = record.revision
+                self._released[line, bucket] = record.revision
                 value = owner_value(nobody, turn_of(ours) + 1, now_ms, record.value["votes"])
                 given.append((bucket, record._replace(value=value)))
         await asyncio.gather(*self._write(given).values())
         self.moves += sum(not self._naming_us(line) for line in lines)
 
     def _write(self, records: Iterable[tuple[str, Record]]) -> dict[str, asyncio.Task[set[str]]]:
-        """Start a task per bucket, which writes its records and returns the lines of refused records."""
+        """Start a task for each bucket, which writes its records.
+
+        Each task returns the lines whose record was refused.
+        """
         by_bucket: dict[str, list[Record]] = {}
         for bucket, record in records:
             by_bucket.setdefault(bucket, []).append(record)
@@ -439,7 +445,7 @@ class OwnerRecords:
         }
 
     async def _write_in(self, bucket: str, records: Sequence[Record]) -> set[str]:
-        """Replace the records whose revision has not changed; return the lines of refused records."""
+        """Replace the records whose revision has not changed; return the lines whose record was refused."""
         follower = self._records.owners[bucket]
         async with self._writing[bucket]:
             if not self._may_write():

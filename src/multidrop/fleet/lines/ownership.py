@@ -28,10 +28,11 @@ LineRecords = Mapping[str, Record | None]
 
 
 class Claim(NamedTuple):
-    """The ownership records that must be written to become the master of a line, as revisions by bucket.
+    """The ownership records that a gateway must write to become the master of a line.
 
-    The `spare` records are written if a write of a `first` record gets no answer. Each written record has
-    this many `votes`.
+    `first` and `spare` contain the buckets, each with the revision of the record to replace. The `spare`
+    records are written only if the write of a `first` record gets no answer. Each record that is written
+    gives the gateway `votes` votes.
     """
 
     first: dict[str, int]
@@ -93,15 +94,15 @@ def claim_of(
     doubted: Collection[str] = (),
     leaderless: Collection[str] = (),
 ) -> Claim | None:
-    """Return the records to write to get enough votes.
+    """Return the records that this session must write to become the line's master.
 
-    Return None if this session has enough votes already, or cannot get enough. In the `doubted` buckets the
-    line's release was sent by this gateway, but its outcome is unknown. Buckets that may be `leaderless` are
-    written last.
+    Return None if it is the master already, or cannot become the master now. `doubted` are the buckets in
+    which this gateway has released the line without getting an answer. `leaderless` are buckets that may have
+    no leader, so the records in them are written last.
     """
     first_bucket, first = next(iter(records.items()), ("", None))
     if not first:
-        return None  # the line's first record, which may have two votes, was not read yet
+        return None  # this record was not read yet; it may give another session two votes
     if first.revision == NONE_YET:
         return Claim({first_bucket: NONE_YET}, {}, 1, NEEDED)
     free: dict[str, int] = {}

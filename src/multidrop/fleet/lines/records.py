@@ -111,7 +111,7 @@ class FleetRecords:
     async def _look_at_plant(self) -> bool:
         try:
             return bool(await self.plant.look())
-        finally:  # also after a failure: records that were read before it are not read again
+        finally:  # records that were read before a failure are not read again, so use them now
             if self._has_plant_changed:
                 self._has_plant_changed = False
                 self._lines = tuple(sorted(filter(self.is_in_plant, self.plant.records)))
@@ -143,7 +143,8 @@ class FleetRecords:
         if turn != seen:
             self._masters[line] = master, turn
             known = before if turn == seen + 1 else None
-            if known != master:  # equal if a gateway claims its own line again after an uncertain release
+            # a gateway that claims its own line again, after an uncertain release, does not move the line
+            if known != master:
                 self.moves.add([Move(line, turn, record.value["since"], known, master)])
 
 
@@ -197,13 +198,14 @@ class ShareFollower(Follower):
         oldest = time.monotonic() - DOUBT_S
         self._doubted = {line: since for line, since in self._doubted.items() if since > oldest}
         if self._asked is None:
-            self._asked = frozenset(line for line in self._share if self._may_change(line))
+            self._asked = frozenset(line for line in self._share if self._must_read(line))
         return sorted(self._doubted.keys() | self._asked)
 
-    def _may_change(self, line: str) -> bool:
-        """Return True if the line's ownership record is unknown, or names another gateway.
+    def _must_read(self, line: str) -> bool:
+        """Return True if the line's ownership record must be read: it is unknown, or names another gateway.
 
-        A record that names no gateway need not be read again: a claim shows whether the line is still free.
+        If the record names no gateway, this gateway writes its claim without reading the record again. The
+        server refuses the claim if the record has changed.
         """
         record = self.records.get(line)
         if record is None:
@@ -211,7 +213,7 @@ class ShareFollower(Follower):
         return owner_of(record)[0] != NOBODY and not self._is_mine(record) and not self._has(line)
 
     async def rest(self) -> None:
-        """Wait until the next read is due. `want` and `doubt` make it due immediately."""
+        """Wait until the next read is due. A call of `want` or `doubt` makes it due immediately."""
         with suppress(TimeoutError):
             await asyncio.wait_for(self._is_urgent.wait(), FOLLOW_S)
 

@@ -35,7 +35,8 @@ class Releases:
         self._on_change = on_change
         self._clock = clock
         self._has_lines = False
-        # by bucket that has a leader: when one of its servers became silent (s); None if all servers answer
+        # the buckets that have a leader, each with the time (s) since when one of its servers is silent, or
+        # with None if all its servers answer
         self._led: dict[str, float | None] = {}
 
     def due(self, lines: Set[str], wait_s: float = SILENT_SERVER_S) -> set[str]:

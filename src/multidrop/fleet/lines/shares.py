@@ -27,15 +27,16 @@ from multidrop.fleet.leases.rules import SECOND
 
 BOUND = 110  # limit of a gateway's lines, in percent of the mean
 NUMBER_BITS = 16  # the low bits of a weight hold its gateway's number
-# while a session starts, lines are assigned only after this time without new or lost gateways
+# a gateway in its first seconds assigns lines only if no other gateway has come or gone for this time
 QUIET_NS = SECOND // 2
 OPENINGS = 3  # number of failed attempts to open a line after which the line is reported to other gateways
 # a line is reported to other gateways if its port is lost and no reply has come for this time
 LOST_NS = 6 * SECOND
-REPLY_NS = 3 * SECOND  # a reply older than this does not show when the port was lost
+# LOST_NS counts from the newest reply, unless that reply is older than this when the loss is first noticed
+REPLY_NS = 3 * SECOND
 # first and longest wait before a gateway again tries to open a line that it has reported
 FIRST_WAIT_NS, LAST_WAIT_NS = 120 * SECOND, 24 * 3600 * SECOND
-# a new attempt at a reported line ends if the line is not assigned to this gateway within this time
+# A trial of a line ends if the line is not assigned to this gateway within this time.
 TRIAL_NS = 60 * SECOND
 MOST_BYTES = 8_000  # limit, in bytes, of the names of reported lines in a lease record
 
@@ -102,7 +103,7 @@ def _hash(name: str) -> int:
 
 
 class Sharers(NamedTuple):
-    """The input of an assignment: the gateways, all lines, and the lines that each gateway could not open."""
+    """All gateways and all lines to assign to them, and the lines that each gateway could not open."""
 
     gateways: tuple[str, ...]
     lines: tuple[str, ...]
@@ -131,9 +132,9 @@ class Shares:
     async def make(self, sharers: Sharers, now: int, *, is_settled: bool) -> bool:
         """Assign the lines to gateways if anything has changed; return True if they were assigned now.
 
-        The work is done in a thread, because it takes long. Before `is_settled`, lines are not assigned while
-        further gateways appear, as at the start of a whole fleet. Otherwise the first gateway would read the
-        records of all lines.
+        The work is done in a thread, because it takes long. `is_settled` is False in the first seconds of
+        this gateway's session. A whole fleet may be starting then, so lines are assigned only after QUIET_NS
+        without new gateways. Otherwise the first gateway would be assigned all lines, and read their records.
         """
         is_early = not is_settled and now - self._seen_at < QUIET_NS
         if sharers == self._made or is_early:
@@ -156,7 +157,7 @@ class UnopenedLines:
     """
 
     def __init__(self, clock: Callable[[], int]) -> None:
-        self.hopeless: frozenset[str] = frozenset()  # lines that all gateways have reported
+        self.hopeless: frozenset[str] = frozenset()  # lines whose ports no gateway could open
         # the lines that this gateway would poll if all ports could be opened; None: unknown
         self.home: frozenset[str] | None = None
         self._clock = clock
@@ -188,14 +189,14 @@ class UnopenedLines:
             self._name(line)
 
     def opened(self, line: str) -> None:
-        """Note that the line's port is open; withdraw its report."""
+        """Stop reporting the line to other gateways, because this gateway has opened its port."""
         self._failures.pop(line, None)
         self._lost_since.pop(line, None)
         self._named.pop(line, None)
         if line == self._tried:  # the network works again: try the other reported lines immediately
             self._tried, self._wait_ns, self._trial_at = "", FIRST_WAIT_NS, self._clock()
             for other in self._named.keys() - (self._named.keys() if self.home is None else self.home):
-                # this line would not be assigned to this gateway after a trial
+                # a trial would fail: this line would be assigned to another gateway
                 del self._named[other]
 
     def gone(self, line: str) -> None:

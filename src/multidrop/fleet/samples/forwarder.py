@@ -58,9 +58,10 @@ class Forwarder:
         self.trouble: str | None = None
 
     def lag_s(self) -> float | None:
-        """Return the age (s, by the system clock) of the oldest message not in the stream yet; 0 without one.
+        """Return the age (s, by the system clock) of the oldest message that is not in the stream yet.
 
-        Return None if the stream's position is not known yet, or if the spool has removed the message.
+        Return 0 if the stream has all messages. Return None if the stream's position is not known yet, or if
+        the spool has removed the message.
         """
         if self.last is None:
             return None

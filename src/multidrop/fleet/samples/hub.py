@@ -102,7 +102,7 @@ class StoredPosition(NamedTuple):
 
 
 class Commit(NamedTuple):
-    """Rows, and the position of their last message, which a sink must store together."""
+    """Rows for a sink, and the stream position of their last message. The sink must store both together."""
 
     stream: str  # identity of the stream, which is the time of its creation
     first: int  # stream position of the commit's first message
@@ -208,7 +208,10 @@ class SampleHub:
             )
 
     async def _commit(self, once: bool) -> bool:
-        """Collect messages and store them; return True if `once` and all messages up to `_end` are stored."""
+        """Collect messages, and store them in one commit.
+
+        If `once` is set, return True when all messages up to the stream position `_end` are stored.
+        """
         messages: list[StreamMessage] = []
         tables: list[Any] = []
         rows, size, ends = 0, 0, None

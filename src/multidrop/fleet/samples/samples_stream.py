@@ -200,8 +200,8 @@ def _checked_fields() -> Iterator[None]:
 class StreamMessage(NamedTuple):
     """A message as the hub reads it. `sequence` is 0 if the message cannot be from a gateway.
 
-    Then its header is missing or invalid, or the message is a server's answer to a read. A client can direct
-    such an answer to any subject, so also into the samples of a gateway.
+    Such a message has no valid `Multidrop-Sequence`, or it is a server's answer to a read request: a client
+    can make a server send the answer to any subject, even to one of the stream's subjects.
     """
 
     place: int
@@ -213,9 +213,9 @@ class StreamMessage(NamedTuple):
 
 
 async def read_after(path: ServerPath, place: int, messages: int, size: int) -> list[StreamMessage]:
-    """Return the next messages after this position, without a gap: at most `messages`, and `size` bytes.
+    """Return at most `messages` messages after this position, with at most `size` bytes together.
 
-    Any replica may answer. Raises FleetError.
+    No message between them is left out. Any replica may answer. Raises FleetError.
     """
     wanted = {"seq": place + 1, "batch": messages, "max_bytes": size, "next_by_subj": f"{STREAM}.>"}
     get = SampleGet()
@@ -232,9 +232,8 @@ async def read_after(path: ServerPath, place: int, messages: int, size: int) -> 
 class SampleGet(DirectGet):
     """Collects the stored messages that answer one read request, parsed from raw headers.
 
-    A sender may write any headers into a message, and the server appends its own headers. A parser that stops
-    at an invalid header would miss the server's headers, and take the sender's claim for the message's
-    origin.
+    The sender of a message may write any headers, even invalid ones or imitations of a server's headers. The
+    server appends its own headers. A parser that stops at an invalid header would read only the sender's.
     """
 
     def __init__(self) -> None:

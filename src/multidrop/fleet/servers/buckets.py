@@ -71,7 +71,10 @@ class WriteAnswers(NamedTuple):
 
 
 def bucket_settings(name: str, replicas: int) -> dict[str, Any]:
-    """Return the settings of a bucket's stream: one record per subject, on disk, which cannot be removed."""
+    """Return the settings of a bucket's stream.
+
+    The stream keeps the newest record of each subject on disk. No client may remove a record.
+    """
     return {
         "name": f"KV_{name}",
         "subjects": [f"$KV.{name}.>"],
@@ -281,10 +284,10 @@ class Follower:
 class LeaseBucket(Bucket):
     """A bucket of leases, to which the gateway `writer` writes records.
 
-    A record's subject is `<gateway>.<writer>`, so servers can check which user writes. A gateway's valid
-    record is the newest one of all writers, and is replaced only at its revision. A gateway may write only in
-    its own name. If another gateway has written the newest record, that record ends the session, whatever it
-    contains.
+    A record's subject is `<gateway>.<writer>`: the gateway whose lease it is, and the gateway that has
+    written it. Servers let a gateway write only with its own name as the writer. The newest record of a
+    gateway is the valid one, whoever has written it. A write must state the revision of that record. If the
+    newest record is from another gateway, it ends the session, whatever it contains.
     """
 
     def __init__(self, name: str, path: Callable[[], ServerPath], writer: str) -> None:

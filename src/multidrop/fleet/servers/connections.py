@@ -51,7 +51,8 @@ MOST_SILENCE_S = 1.0  # limit of the wait before a repeat, because requests time
 # The usual response time is the longest recent one. Each answer multiplies it by this factor, so that one
 # slow answer is forgotten after about a hundred fast ones.
 FORGET = 0.97
-# Limit of saved repeats: twice as many as are needed until servers notice a dead route (3 s).
+# Limit of the repeats that a process can save up for later. Until servers notice a dead route (after 3 s), a
+# process needs half as many.
 MOST_REPEATS = 300.0
 EARNED = 0.5  # each timely answer allows this many further repeats
 

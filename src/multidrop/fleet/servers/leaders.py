@@ -31,8 +31,8 @@ HAND_OVER_S = 3.0  # pause between hand-overs of one bucket: shorter than the ti
 SILENT_FOR_S = 60.0
 HANDED_S = 1.0  # time limit of a hand-over; it takes 0.03 to 0.3 s
 LEADER_LOOK_S = 0.02
-# pause between checks by `keep_leaders`: leaders notice a silent server after 2 s, and that server starts
-# elections after 4 s
+# Pause between checks by `keep_leaders`. Leaders report a silent server after 2 s, and the server starts its
+# first election after 4 s. So several checks find the silent server before that election.
 KEEP_S = 0.4
 
 
@@ -163,10 +163,10 @@ class LeaseTerms:
         self._handed_at: dict[str, float] = {}  # time of the last hand-over, by bucket
 
     async def keep_ahead(self, path: ServerPath, clusters: Mapping[str, Cluster]) -> bool:
-        """Hand over each lease bucket that has a silent server, unless its last hand-over is too recent.
+        """Move the leadership of each lease bucket that has a silent server to another server.
 
-        Return True if a hand-over was tried. Stop after a failed hand-over, so that at most one bucket must
-        wait for an election.
+        Skip a bucket whose leadership has moved less than HAND_OVER_S ago. Return True if a move was tried.
+        Stop after a failed move, so that at most one bucket must wait for an election.
         """
         led = {bucket: clusters[bucket] for bucket in names.LEASES if bucket in clusters}
         silent = {bucket: cluster for bucket, cluster in led.items() if cluster.has_silent}

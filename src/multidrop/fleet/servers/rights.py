@@ -43,8 +43,8 @@ LAST_ANSWER = "10s"  # how long the server forwards further answers to one reque
 ANSWER = '{ max: 1, expires: "1m" }'  # limits of answers to one request; a stop of many drives may take long
 _STORED = ("$JS.", "$KV.", f"{STREAM}.")
 _MANY = "$JS.API.DIRECT.GET."  # prefix of JetStream requests that get several answers
-# A request that each account imports but no user may send: without the import, a server answers every
-# JetStream request in the account with "not enabled".
+# Each account must import this request, although no user has the right to send it. Without the import, a
+# server answers every JetStream request in the account with "not enabled".
 _INFO = "$JS.API.INFO"
 
 

@@ -132,7 +132,8 @@ async def _remove(path: ServerPath, stream: str) -> None:
 async def _retried(path: ServerPath, attempt: Callable[[], Awaitable[T]]) -> T:
     """Repeat an attempt for up to WAIT_S, because an election or another change may be in progress.
 
-    Raises NoRight, the servers' last refusal, or FleetError if the servers have no quorum.
+    Raises NoRight immediately. After WAIT_S, raises ServerError if the servers refuse the request, FleetError
+    if they have no quorum.
     """
     loop = asyncio.get_running_loop()
     ends = loop.time() + WAIT_S
