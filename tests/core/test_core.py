@@ -284,7 +284,7 @@ def test_queued_exchanges_are_carried_out_between_repeated_exchanges(port: Port,
     assert sent[at] >= due_ns
 
 
-def test_repeating_stops_when_a_request_cannot_be_sent(drive: Drive) -> None:
+def test_exchanges_are_no_longer_repeated_once_one_cannot_be_sent(drive: Drive) -> None:
     slow = Peer(least_timeout=0.01, most_timeout=0.02)
     with closing(Port(drive(lambda _: b""), NO_SETTINGS)) as port:
         assert port.carry_out(read(1, peer=slow)).result == Failure.NO_REPLY
@@ -295,7 +295,7 @@ def test_repeating_stops_when_a_request_cannot_be_sent(drive: Drive) -> None:
         assert rows.of("status", 1) == [Status.LATE_ANSWER_DUE]
 
 
-def test_await_calls_returns_when_a_drive_fails_and_when_it_recovers(drive: Drive) -> None:
+def test_a_waiting_client_wakes_when_a_drive_fails_or_recovers(drive: Drive) -> None:
     silent = threading.Event()
     silent.set()
     peer = Peer(least_timeout=0.01, most_timeout=0.3)
@@ -502,7 +502,7 @@ def test_a_stop_precedes_waiting_requests_and_cancels_earlier_ones_of_its_drive(
         for thread in threads:
             thread.start()
             wait_until_it_sleeps(thread)  # so that the waiting requests arrive in this order
-        latch.rise("a stop was called")
+        latch.revoke("a stop was called")
         late = [written(2, 52, permit=latch.permit()), written(2, 99, insists=True)]
         for exchange in late:
             threads.append(threading.Thread(target=carry_out, args=[exchange]))
@@ -544,7 +544,7 @@ def test_the_write_permit_of_a_call_that_began_before_a_stop_is_invalid() -> Non
     latch = Latch()
     seen = latch.c[0]
     assert latch.permit(seen).is_good
-    latch.rise("a stop")
+    latch.revoke("a stop")
     assert not latch.permit(seen).is_good
     assert latch.permit().is_good
 
@@ -732,7 +732,7 @@ def test_cut_off_is_true_only_if_the_port_is_lost_after_a_reply(answered: int, w
         if way == "queued":
             until(lambda: port.done == answered + 1)
         else:
-            assert port.repeat([]) == 1  # comes next, because it got no reply
+            assert port.repeat([]) == 1  # index of the exchange that comes next: the one without a reply
 
 
 def test_a_pty_whose_far_end_hangs_up_is_lost() -> None:
@@ -777,7 +777,7 @@ def test_the_time_of_a_settings_change_is_measured() -> None:
     os.close(master)
 
 
-def test_a_descriptor_without_settings_is_lost_if_settings_are_required(drive: Drive) -> None:
+def test_a_port_without_serial_settings_is_lost_if_they_are_required(drive: Drive) -> None:
     with closing(Port(drive(echo_start), ANY_SETTINGS)) as port:
         found = port.carry_out(read(0))
         assert (found.result, found.error) == (Failure.LINE_LOST, errno.ENOTTY)
@@ -895,7 +895,7 @@ def test_memory_does_not_grow_over_many_exchanges(drive: Drive, exchanges: int) 
         port.report_to(row_queue, 0)
         port.repeat([asked])
         before = resident_after(5_000)
-        assert resident_after(exchanges) - before < 1_000_000  # less than 20 or 100 bytes for each exchange
+        assert resident_after(exchanges) - before < 1_000_000  # bytes, for all exchanges together
 
 
 @table("status", list(Status))

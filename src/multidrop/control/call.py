@@ -89,7 +89,7 @@ class Latches:
     def rise(self, drives: Sequence[Drive]) -> None:
         """Cancel all calls that move these drives. Called right before a stop is written."""
         for drive in drives:
-            self.latch(drive).rise(STOPPED)
+            self.latch(drive).revoke(STOPPED)
 
     def begin(self, stop: object, drives: Sequence[Drive]) -> None:
         """Start a stop. Until `over(stop)`, cancel and refuse moves of these drives, and keep them attached.

@@ -16,39 +16,39 @@ class Latch:
     """A drive's stop counter, which the core checks right before a request is sent.
 
     `count` is the number of stops so far: a drive that is attached again gets a new latch, which continues
-    the count. `rise` takes no lock, so a signal handler may call it.
+    the count. `revoke` takes no lock, so a signal handler may call it.
     """
 
     def __init__(self, count: int = 0) -> None:
         self.c: Any = ffi.new("uint32_t *", count)
-        self.why = ""  # why permits were last invalidated; after `shut`, why all permits are invalid
+        self.why = ""  # why permits were last revoked; after `shut`, why no permit is valid
         self._is_shut = False
         self._holds: set[object] = set()  # stops in progress, during which new permits are invalid
 
-    def rise(self, why: str) -> None:
-        """Invalidate all existing permits."""
+    def revoke(self, why: str) -> None:
+        """Make all existing permits invalid, so that their writes are not sent."""
         if not self._is_shut:
             self.why = why
         lib.md_count_stop(self.c)
 
     def shut(self, why: str) -> None:
-        """Invalidate all existing and future permits."""
+        """Revoke all permits; from now on, new permits are invalid too."""
         if not self._is_shut:
             self.why = why
         self._is_shut = True
-        self.rise(why)
+        self.revoke(why)
 
     def hold(self, stop: object, why: str) -> None:
-        """Invalidate all existing permits, and new ones until `let_go` is called for this stop."""
+        """Revoke all permits; new ones are invalid too until `let_go` is called for this stop."""
         self._holds.add(stop)
-        self.rise(why)
+        self.revoke(why)
 
     def let_go(self, stop: object) -> None:
         """End this stop's `hold`: new permits are valid again, unless another stop is in progress."""
         self._holds.discard(stop)
 
     def permit(self, seen: int | None = None) -> Permit:
-        """Return a permit that is valid until the next `rise`.
+        """Return a permit that is valid until permits are revoked.
 
         A permit made during a stop or after `shut` is never valid.
 
@@ -56,7 +56,7 @@ class Latch:
         """
         if seen is None:
             seen = int(self.c[0])
-        # checked after `seen` was read, so that a `rise` in between is noticed
+        # checked only now, so that a stop after `seen` was read is noticed
         if self._is_shut or self._holds:
             seen = (seen - 1) & 0xFFFF_FFFF
         return Permit(self, seen)
@@ -133,11 +133,12 @@ class Mastership:
         return not self._is_inherited and bool(lib.md_mastership_holds(self.c))
 
     def extend(self, until_ns: int) -> None:
-        """Set the deadline to this time, and the kernel's timer to `guard_s / 2` seconds after it.
+        """Set the deadline to this time, unless the present deadline is later.
 
-        A time before the present deadline has no effect. After `end`, a call starts the mastership again.
+        The kernel's timer, which kills a suspended process, is set to `guard_s / 2` seconds after the
+        deadline. After `end`, a call starts the mastership again.
 
-        Raises ValueError, without any change, if the time is past: such a timer would kill immediately.
+        Raises ValueError if the time is past, and changes nothing: the timer would kill this process now.
         """
         if isinstance(until_ns, bool) or not isinstance(until_ns, int):
             raise TypeError(f"until_ns is a whole number of ns of CLOCK_BOOTTIME, not {until_ns!r}")
