@@ -84,7 +84,7 @@ def _name(port: str, address: int) -> str:
 
 
 def start_lateness_us(ports: Sequence[str], baudrate: int, every: float, seconds: float) -> list[float]:
-    """Return by how many us each request was sent after it was due, for one drive per line."""
+    """Return how late each request was sent, in us. Each line has one drive."""
     with polling_lines(ports, baudrate, 1, every) as poller:
         batches = list(poller.batches(seconds))
         grids = {_name(line.name, 1): line.started_ns for line in poller._lines}
@@ -167,7 +167,7 @@ def judge(ports: Sequence[str], exchanges: int, drives: int) -> Judged:
 
 
 def judge_for(ports: Sequence[str], seconds: float, drives: int) -> Judged:
-    """Poll and compare values like `judge`, for `seconds`."""
+    """Poll for `seconds`, and compare each value with the true value of its register."""
     end = time.monotonic() + seconds
     return _judged(ports, drives, lambda judged: time.monotonic() >= end)
 

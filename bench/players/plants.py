@@ -63,7 +63,10 @@ def write_plant(directory: Path, lines: int) -> Path:
 
 
 def proofs(plant: Plant) -> dict[tuple[str, str], float]:
-    """Return the constant value of each register, by drive and register name; leave out motors."""
+    """Return the one value that each polled register always has, by drive and register name.
+
+    Motors are left out, because their values change.
+    """
     return {
         (drive.drive.name, poll.register.name): proof(drive.drive, poll.register)
         for line in plant.lines
@@ -97,7 +100,10 @@ class RunningPlant:
 
 
 def hostile_wires(plant: Path, faults: Faults) -> list[Wire]:
-    """Return the plant's lines with these faults; all drives except the motors have encoded values."""
+    """Return the plant's lines with these faults.
+
+    The value of each register encodes its drive and its address, except in motors.
+    """
     return [
         FaultyWire(
             [

@@ -30,7 +30,7 @@ class Counters:
     turning: int = 0  # motors that still turn after the stop
     moved: int = 0  # frames that move a motor after its stop
     unsent: int = 0  # stops that never reached the line
-    excused: int = 0  # motors that turn after an aborted stop that was reported
+    excused: int = 0  # motors that still turn, although the program reported that their stop was aborted
     first_ms: list[float] = field(default_factory=list)  # ms from each request to the first stop frame
     stories: list[str] = field(default_factory=list)
 

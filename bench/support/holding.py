@@ -90,7 +90,7 @@ def family_of(entries: list[Holding]) -> str:
     }
     for name, register in members.items():
         object.__setattr__(register, "name", name)
-        # the scale register is not checked again: its name differs here
+        # `_why_not` has checked the scale register; here its name is another one
         object.__setattr__(register, "scale_register", "")
     return _refusal(members)
 
@@ -113,7 +113,7 @@ def _commanded(entry: ImportedRegister) -> Holding:
 
 
 def _why_not(entry: ImportedRegister) -> str:
-    """Return why a family cannot declare the entry as the other program uses it; "" if a family can."""
+    """Return why a family cannot declare an entry of another program's file; "" if it can."""
     try:
         register = _declared(entry)
     except ValueError as refusal:

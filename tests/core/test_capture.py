@@ -98,7 +98,7 @@ def test_a_sniffed_frame_has_the_time_of_its_first_piece() -> None:
     assert [span.time_ns for span in spans] == [0, 1, 3]
 
 
-def test_a_copy_of_a_write_request_right_after_it_is_its_reply() -> None:
+def test_the_copy_that_follows_a_write_request_is_its_reply() -> None:
     assert kinds(split(READ, ANSWER, *[WRITE] * 6)) == [Kind.REQUEST, Kind.REPLY] * 4
 
 
@@ -119,7 +119,7 @@ def test_a_delixi_reply_is_not_mistaken_for_a_request() -> None:
     ]
 
 
-def test_a_repeated_write_request_is_no_reply_if_the_sender_of_bytes_is_known() -> None:
+def test_a_repeated_write_request_is_a_request_if_the_master_sent_it() -> None:
     stream = Stream()
     stream.put(WRITE, 0, side=Side.ANSWERING)
     stream.put(WRITE, 1, side=Side.ASKING)

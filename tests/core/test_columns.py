@@ -79,7 +79,7 @@ def test_raw_value_decodes_each_number_format(wire: int, data: str, value: float
     assert raw_value(bytes.fromhex(data), 0, wire) == value
 
 
-def test_every_half_float_equals_struct() -> None:
+def test_every_16_bit_float_is_decoded_as_by_struct() -> None:
     data = b"".join(bits.to_bytes(2) for bits in range(1 << 16))
     for at, (number,) in enumerate(iter_unpack(">e", data)):
         found = raw_value(data, at, NumberFormat.F16)
@@ -318,7 +318,7 @@ def test_a_bound_is_rounded_up_to_the_next_float(numbers: list[int]) -> None:
         assert number <= found <= number + abs(number) // 2**23
 
 
-def test_an_array_is_widened_from_its_valid_numbers_only() -> None:
+def test_only_valid_uncertainties_are_widened_to_64_bits() -> None:
     floats = struct.pack("<4f", 7.0, float("nan"), float("inf"), 1e30)
     assert list(widen(memoryview(floats), memoryview(b"\x01"), 4).cast("q")) == [7, 0, 0, 0]
     for bit in (2, 4, 8):
@@ -335,7 +335,9 @@ def test_one_byte_codes_are_assigned_in_the_order_of_use() -> None:
     table = CodeTable([f"name {number}" for number in range(400)])
     assert bytes(table.narrow(memoryview(array("H", [9, 0, 9, 399]))) or b"") == bytes([0, 1, 0, 2])
     assert table.used == ("name 9", "name 0", "name 399")
-    assert table.narrow(memoryview(array("H", range(256)))) is None  # 257 codes, with "name 399"
+    assert (
+        table.narrow(memoryview(array("H", range(256)))) is None
+    )  # too many codes for one byte: with "name 399" they are 257
     table.forget()
     assert bytes(table.narrow(memoryview(array("H", range(256)))) or b"") == bytes(range(256))
     with pytest.raises(ValueError, match="status 400 has no name"):

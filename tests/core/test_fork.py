@@ -256,7 +256,7 @@ def test_a_child_does_not_wait_for_a_poller_lock_held_in_the_parent(port: str) -
         until(lambda: is_polled(poller))
 
 
-def test_a_function_wrapped_by_only_here_does_nothing_in_a_child_process() -> None:
+def test_a_wrapped_function_does_nothing_in_a_child_process() -> None:
     given: list[str] = []
     give_back = only_here(given.append)
 
@@ -296,7 +296,12 @@ with Simulator([Wire([simulated(Toy(1))], unpaced=True)]) as simulator:
 
 @pytest.mark.long
 def test_the_exit_of_a_child_does_not_end_the_parents_simulator() -> None:
-    shown = ["-W", "ignore", "-W", "always::ResourceWarning"]  # of sockets that the child does not close
+    shown = [
+        "-W",
+        "ignore",
+        "-W",
+        "always::ResourceWarning",
+    ]  # a socket that the child leaves open is reported on stderr
     words = [sys.executable, *shown, "-c", LEFT.format(support=str(Path(toy.__file__).parent))]
     done = subprocess.run(words, capture_output=True, text=True, timeout=PATIENCE, check=False)
     assert (done.stdout, done.stderr, done.returncode) == ("0\n", "", 0)

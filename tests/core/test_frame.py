@@ -70,7 +70,7 @@ def carry_out(framing: Framing, request: Message, received: bytes, piece: int = 
     return line.completion
 
 
-def test_every_printed_frame_is_parsed() -> None:
+def test_all_frames_printed_in_manuals_are_tested() -> None:
     # 19 replies equal their requests
     assert len({(each.framing, each.direction, each.frame) for each in PRINTED}) == 49 + 19
     assert len(GOOD_REQUESTS) + len(GOOD_REPLIES) + len(REFUSED) == len(PRINTED)
@@ -98,7 +98,7 @@ def test_function_89h_is_accepted_for_88h_but_never_sent() -> None:
     request = Message(1, 0x08, 0, data=words(0xA537))
     assert parse_reply(RTU, bytes.fromhex(MISPRINTED), request) == (5, refusal)
     assert build_reply(RTU, refusal) == bytes.fromhex("01 88 01 87 C0")
-    # 89H is accepted as an exception only to function 08
+    # in a reply to function 03, 89H is a wrong function
     assert parse_reply(RTU, bytes.fromhex(MISPRINTED), Message(1, 0x03, 0, 1))[0] == FrameFault.BAD_FUNCTION
 
 
@@ -180,7 +180,7 @@ WRONG = [
     ("half a register more", RTU, READ_TWO, rtu("01 03 05 11 11 22 22 33"), FrameFault.BAD_LENGTH),
     ("no register", RTU, READ_TWO, rtu("01 03 00"), FrameFault.BAD_LENGTH),
     ("16 coils for 8", RTU, Message(1, 0x01, 0, 8), rtu("01 01 02 FF FF"), FrameFault.BAD_LENGTH),
-    # pymodbus accepts another value, libmodbus another address or value of 05, 06 and 10H
+    # pymodbus accepts another value; libmodbus also another address (functions 05, 06 and 10H)
     ("coil confirmed off that was set on", RTU, WRITE_COIL, rtu("01 05 00 03 00 00"), FrameFault.BAD_ECHO),
     ("another coil confirmed", RTU, WRITE_COIL, rtu("01 05 00 04 FF 00"), FrameFault.BAD_ECHO),
     ("another value confirmed", RTU, WRITE_ONE, rtu("01 06 00 10 12 35"), FrameFault.BAD_ECHO),
@@ -304,7 +304,9 @@ def test_a_mask_write_and_its_confirmation_are_the_same_frame(framing: Framing) 
         (Message(1, 0x18, 0x04DE), "01 18 04 DE", "01 18 00 04 00 01 01 B8", b"\0\x04\0\x01\x01\xb8"),
     ],
 )
-def test_counters_logs_and_queues_are_read(request: Message, sent: str, reply: str, data: bytes) -> None:
+def test_replies_with_event_counters_logs_or_fifo_queues_are_parsed(
+    request: Message, sent: str, reply: str, data: bytes
+) -> None:
     assert build_request(RTU, request) == rtu(sent)
     length, found = parse_reply(RTU, rtu(reply), request)
     assert (length, found and found.data) == (len(rtu(reply)), data)

@@ -1,6 +1,6 @@
-"""If late replies are possible, a request whose reply would be ambiguous waits for the reply to a check read.
+"""If a late reply could be mistaken for a request's reply, the core sends a distinctive read first.
 
-A check read (`proof` in the code) is a read whose reply no late reply can resemble.
+A read is distinctive (`proof` in the code) if no late reply can resemble its reply.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ AGAIN = Message(1, 6, 9, data=words(1))
 
 @pytest.fixture
 def proof(line: LineDriver, drive: Peer) -> Exchange:
-    """Let READ time out, and the time for its late reply pass. Return the check read, a longer one."""
+    """Let READ time out, and the time for its late reply pass. Return a distinctive (longer) read."""
     found = exchange(LONGER, drive)
     drive.prove_by([found])
     time_out(line, drive, READ)
@@ -39,7 +39,9 @@ def is_barred(line: LineDriver, drive: Peer, request: Message) -> bool:
 
 
 @pytest.mark.usefixtures("proof")
-def test_no_read_is_sent_while_a_late_reply_could_pass_for_its_reply(line: LineDriver, drive: Peer) -> None:
+def test_no_read_is_sent_while_a_late_reply_could_be_mistaken_for_its_reply(
+    line: LineDriver, drive: Peer
+) -> None:
     assert is_barred(line, drive, OTHER)
     ask(line, drive, Message(1, 4, 50, 1))  # a late reply to READ does not fit this request
 
@@ -52,9 +54,11 @@ def test_a_write_waits_for_the_reply_to_an_earlier_write(line: LineDriver, drive
 
 
 @pytest.mark.parametrize("late", [0, 1])
-def test_check_read_reply_ends_the_wait(line: LineDriver, drive: Peer, proof: Exchange, late: int) -> None:
+def test_a_distinctive_reply_ends_the_wait_for_late_replies(
+    line: LineDriver, drive: Peer, proof: Exchange, late: int
+) -> None:
     line.send(proof)
-    for _ in range(late):  # a late reply before that of the check read is skipped
+    for _ in range(late):  # a late reply comes first, and is skipped
         line.receive(reply(1111))
         assert line.listens
     assert drive.counters().late == late
@@ -63,7 +67,9 @@ def test_check_read_reply_ends_the_wait(line: LineDriver, drive: Peer, proof: Ex
     assert line.data_after(reply(2222)) == words(2222)
 
 
-def test_an_unanswered_check_read_prolongs_the_wait(line: LineDriver, drive: Peer, proof: Exchange) -> None:
+def test_requests_still_wait_after_an_unanswered_distinctive_read(
+    line: LineDriver, drive: Peer, proof: Exchange
+) -> None:
     line.send(proof)
     line.wait_until_done()
     assert line.completion.result == Failure.NO_REPLY
@@ -72,7 +78,7 @@ def test_an_unanswered_check_read_prolongs_the_wait(line: LineDriver, drive: Pee
 
 
 def ask_in_vain(line: LineDriver, drive: Peer, proof: Exchange) -> None:
-    """Let the drive answer another request, but neither READ nor the check read."""
+    """Let the drive answer another request, but neither READ nor the distinctive read."""
     ask(line, drive, Message(1, 4, 50, 1))
     line.receive(build_reply(Framing.RTU, Message(1, 4, data=words(2222))))
     assert line.completion.result > 0
@@ -83,7 +89,9 @@ def ask_in_vain(line: LineDriver, drive: Peer, proof: Exchange) -> None:
     line.now = drive.late_until_ns + MS
 
 
-def test_requests_go_on_if_check_reads_get_no_reply(line: LineDriver, drive: Peer, proof: Exchange) -> None:
+def test_requests_are_sent_again_if_distinctive_reads_get_no_reply(
+    line: LineDriver, drive: Peer, proof: Exchange
+) -> None:
     """Some devices do not reply to reads of registers that they do not have."""
     ask_in_vain(line, drive, proof)
     assert is_barred(line, drive, OTHER)
@@ -92,7 +100,9 @@ def test_requests_go_on_if_check_reads_get_no_reply(line: LineDriver, drive: Pee
 
 
 @pytest.mark.parametrize("is_late", [True, False])
-def test_answered_check_read_is_kept(line: LineDriver, drive: Peer, proof: Exchange, is_late: bool) -> None:
+def test_a_distinctive_read_stays_in_use_once_it_was_answered(
+    line: LineDriver, drive: Peer, proof: Exchange, is_late: bool
+) -> None:
     if is_late:
         ask_in_vain(line, drive, proof)
     else:
@@ -103,7 +113,9 @@ def test_answered_check_read_is_kept(line: LineDriver, drive: Peer, proof: Excha
     assert is_barred(line, drive, OTHER)
 
 
-def test_a_silent_drive_keeps_its_check_reads(line: LineDriver, drive: Peer, proof: Exchange) -> None:
+def test_a_distinctive_read_stays_in_use_while_the_drive_is_silent(
+    line: LineDriver, drive: Peer, proof: Exchange
+) -> None:
     for _ in range(3):
         line.send(proof)
         line.wait_until_done()
@@ -112,7 +124,7 @@ def test_a_silent_drive_keeps_its_check_reads(line: LineDriver, drive: Peer, pro
 
 
 @pytest.mark.usefixtures("proof")
-def test_a_stop_does_not_wait_for_the_reply_to_a_check_read(line: LineDriver, drive: Peer) -> None:
+def test_a_stop_is_sent_without_a_distinctive_read(line: LineDriver, drive: Peer) -> None:
     time_out(line, drive, WRITE)
     stop = exchange(AGAIN, drive)
     stop.c.insists = 1
@@ -143,7 +155,7 @@ def test_a_late_reply_is_counted_once(line: LineDriver, drive: Peer) -> None:
 
 
 @pytest.mark.usefixtures("proof")
-def test_a_reply_is_found_after_a_late_reply_during_its_request(line: LineDriver, drive: Peer) -> None:
+def test_a_late_reply_is_skipped_while_a_request_is_being_sent(line: LineDriver, drive: Peer) -> None:
     """The port accepts the request in two parts, and the late reply arrives between them."""
     line.begin(exchange(Message(1, 4, 50, 1), drive))
     while line.want != "write":
@@ -156,8 +168,8 @@ def test_a_reply_is_found_after_a_late_reply_during_its_request(line: LineDriver
 
 
 @pytest.mark.usefixtures("proof")
-def test_a_reply_is_found_after_noise_before_its_request(line: LineDriver, drive: Peer) -> None:
-    """The noise contained a late reply."""
+def test_noise_and_a_late_reply_are_skipped_before_a_request(line: LineDriver, drive: Peer) -> None:
+    """The bytes of a late reply come after noise, before the request is sent."""
     line.begin(exchange(Message(1, 4, 50, 1), drive))
     while line.want != "write":
         line.receive(b"\x07")
@@ -186,7 +198,9 @@ def test_a_reply_is_in_doubt_if_it_may_answer_another_request(line: LineDriver, 
 
 
 @pytest.mark.usefixtures("proof")
-def test_no_reply_is_in_doubt_after_a_check_read(line: LineDriver, drive: Peer, proof: Exchange) -> None:
+def test_the_next_reply_is_certain_after_a_distinctive_read(
+    line: LineDriver, drive: Peer, proof: Exchange
+) -> None:
     line.send(proof)
     line.receive(PROOF_REPLY)
     assert has_sure_reply(line, drive)
@@ -194,7 +208,7 @@ def test_no_reply_is_in_doubt_after_a_check_read(line: LineDriver, drive: Peer, 
 
 @pytest.fixture
 def first(drive: Peer) -> Exchange:
-    """Return the check read of a drive whose first reply may be to another process's READ."""
+    """Return the distinctive read of a drive whose first reply may answer another process's READ."""
     found = exchange(LONGER, drive)
     drive.prove_by([found, exchange(Message(1, 3, 0, 3), drive)])
     drive.doubt_first_reply()
@@ -205,12 +219,14 @@ def is_in_doubt(line: LineDriver) -> bool:
     return line.want == "done" and line.completion.result == Failure.LATE_ANSWER_DUE
 
 
-def test_a_check_read_ends_doubt_about_first_reply(line: LineDriver, drive: Peer, first: Exchange) -> None:
+def test_replies_are_accepted_once_a_distinctive_read_is_answered(
+    line: LineDriver, drive: Peer, first: Exchange
+) -> None:
     ask(line, drive, READ)
-    line.receive(reply(7777))  # the reply to the other process
+    line.receive(reply(7777))  # the reply to another process's READ
     assert is_in_doubt(line)
     line.send(first)
-    line.receive(reply(1111))  # the reply to READ
+    line.receive(reply(1111))  # the reply to this process's READ
     assert line.listens
     line.receive(PROOF_REPLY)
     ask(line, drive, READ)
@@ -218,7 +234,9 @@ def test_a_check_read_ends_doubt_about_first_reply(line: LineDriver, drive: Peer
     assert drive.counters().late == 0  # this drive has answered each request in time
 
 
-def test_an_exception_leaves_the_first_reply_in_doubt(line: LineDriver, drive: Peer, first: Exchange) -> None:
+def test_the_next_reply_is_in_doubt_if_the_first_was_an_exception(
+    line: LineDriver, drive: Peer, first: Exchange
+) -> None:
     ask(line, drive, READ)
     line.receive(build_reply(Framing.RTU, Message(1, 3, exception=2)))
     assert (line.want, line.completion.reply.exception) == ("done", 2)
@@ -246,15 +264,15 @@ def test_a_stop_accepts_a_first_reply_that_is_in_doubt(line: LineDriver, drive: 
         assert line.completion.result > 0
 
 
-def test_the_first_reply_is_accepted_if_the_drive_has_no_check_reads(line: LineDriver, drive: Peer) -> None:
+def test_the_first_reply_is_accepted_if_no_read_is_distinctive(line: LineDriver, drive: Peer) -> None:
     drive.doubt_first_reply()
     ask(line, drive, READ)
     assert line.data_after(reply(1111)) == words(1111)
 
 
 @pytest.mark.parametrize("least", [0, 1, 0xFFFF])
-def test_a_known_value_of_any_size_identifies_a_reply(line: LineDriver, drive: Peer, least: int) -> None:
-    """Delixi's P04.28 is 0 at 1200 baud. This 0 must not mean "any value": then no read would be sent."""
+def test_a_reply_is_recognised_by_its_known_value(line: LineDriver, drive: Peer, least: int) -> None:
+    """The value can be 0, as that of Delixi's P04.28 is at 1200 baud."""
     known = exchange(READ, drive, answer=(least, least))
     drive.prove_by([known, exchange(OTHER, drive, answer=(7, 7))])
     time_out(line, drive, Message(1, 3, 90, 1))

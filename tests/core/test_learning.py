@@ -166,7 +166,7 @@ def test_a_write_waits_at_least_its_own_timeout_for_its_reply(line: LineDriver, 
     assert line.now - left == 1000 * MS + 8 * CHARACTER
 
 
-AWAITED = 3 * CHARACTER  # the wait for the first character, plus two more
+AWAITED = 3 * CHARACTER  # added to the timeout: the duration of the reply's first character, and of two more
 LONG = Message(1, 3, 0, 100)  # its reply has 205 characters
 
 
@@ -182,7 +182,9 @@ def gathered(line: LineDriver, drive: Peer, request: Message = READ) -> None:
 
 
 @pytest.mark.parametrize("asked", [READ, LONG], ids=["short", "long"])
-def test_the_wait_for_no_reply_excludes_its_length(line: LineDriver, drive: Peer, asked: Message) -> None:
+def test_the_wait_for_a_missing_reply_does_not_depend_on_its_length(
+    line: LineDriver, drive: Peer, asked: Message
+) -> None:
     answer(line, drive, 2 * MS)
     assert given_up(line, drive, asked) == LEAST + AWAITED
 
@@ -263,8 +265,10 @@ def test_a_late_reply_is_expected_after_a_lost_port_is_reopened(line: LineDriver
 
 
 @pytest.mark.parametrize("is_row", [True, False], ids=["for a row", "for a client"])
-def test_a_polled_value_in_doubt_has_the_earlier_time(line: LineDriver, drive: Peer, is_row: bool) -> None:
-    """A read by `Bus` gets no value until a proof has shown that no late reply is due."""
+def test_a_doubtful_polled_value_has_the_time_of_the_earlier_request(
+    line: LineDriver, drive: Peer, is_row: bool
+) -> None:
+    """A read by `Bus` gets no value yet: the core must first be sure that no late reply is due."""
     drive.prove_by([exchange(LONGER, drive), exchange(Message(1, 3, 0, 3), drive)])
     rows = RowLayout(0, [Field(0, NumberFormat.U16, 0, 1.0, 1.0)]) if is_row else None
     asked = exchange(READ, drive, block=rows)
@@ -310,8 +314,8 @@ def test_no_late_reply_is_expected_to_an_unsent_request(line: LineDriver, drive:
     assert drive.late_until_ns == 0
 
 
-def test_a_request_is_sent_if_no_late_reply_could_pass_for_its_own(line: LineDriver, drive: Peer) -> None:
-    """A stop is a write to which the late reply to a read does not fit."""
+def test_a_request_is_sent_if_no_late_reply_resembles_its_reply(line: LineDriver, drive: Peer) -> None:
+    """A stop is a write: the late reply to a read differs from its reply."""
     time_out(line, drive)
     ask(line, drive, WRITE)
 
@@ -546,7 +550,9 @@ def all_looks(
     return [looks(line, drive, delay, details) for delay in delays]
 
 
-def test_seven_of_eight_replies_for_a_waiting_caller_need_one_read(line: LineDriver, drive: Peer) -> None:
+def test_seven_of_eight_replies_to_a_steady_drives_reads_are_taken_at_once(
+    line: LineDriver, drive: Peer
+) -> None:
     all_looks(line, drive, STEADY, FOR_A_CLIENT)
     found = all_looks(line, drive, 80 * [15 * MS], FOR_A_CLIENT)
     assert sum(times == 1 for times, _ in found) == 70

@@ -30,7 +30,9 @@ CHARACTER = 1 * MS  # a request of 8 characters takes 8 ms
 SILENCE = 4 * MS
 TIMEOUT = 100 * MS
 TURNAROUND = 200 * MS
-ETIMEDOUT = 138 if sys.platform == "win32" else errno.ETIMEDOUT  # the number in C, which is not Winsock's
+ETIMEDOUT = (
+    138 if sys.platform == "win32" else errno.ETIMEDOUT
+)  # from C's errno.h; Python has the number of Winsock
 
 READ = Message(1, 0x03, 0, 1)
 READ_TWO = Message(1, 0x03, 0, 2)
@@ -390,7 +392,9 @@ REASONS = [
 @pytest.mark.parametrize(
     ("received", "reason"), [each[1:] for each in REASONS], ids=[each[0] for each in REASONS]
 )
-def test_a_timeout_gives_the_reason(line: LineDriver, received: bytes, reason: int, piece: int) -> None:
+def test_a_timeout_reports_what_is_wrong_with_the_received_bytes(
+    line: LineDriver, received: bytes, reason: int, piece: int
+) -> None:
     ask(line, READ_TWO)
     sent = line.now
     answer(line, received, piece)
@@ -493,7 +497,9 @@ def test_a_reply_after_another_masters_read_is_not_accepted(line: LineDriver, pi
 
 
 @pytest.mark.parametrize("before", ["02 03 00 40 00 01", "01 04 00 40 00 01", "01 06 00 40 00 01"])
-def test_a_reply_after_another_masters_other_request_is_accepted(line: LineDriver, before: str) -> None:
+def test_a_reply_is_accepted_if_another_master_sent_a_different_request(
+    line: LineDriver, before: str
+) -> None:
     assert exchanged(line, rtu(before) + reply_of(7)).reply.data == words(7)
 
 
@@ -578,7 +584,7 @@ def test_a_reply_is_found_after_a_damaged_echo(line: LineDriver, cut: tuple[int,
     assert exchanged(line, confirmation(), WRITE).result == Failure.NO_REPLY
 
 
-def test_confirmations_are_accepted_again_after_two_replies_without_an_echo(line: LineDriver) -> None:
+def test_write_confirmations_are_accepted_after_two_replies_without_echo(line: LineDriver) -> None:
     """One reply without echo is not enough: the echo may have been lost."""
     teach_echo(line)
     exchanged(line, reply_of(1))
@@ -651,7 +657,10 @@ def test_an_echo_without_a_reply_shows_that_the_adapter_echoes(line: LineDriver)
 
 
 def test_a_delixi_value_of_0_is_found_after_the_echo_of_its_query(line: LineDriver) -> None:
-    """A query's echo equals a reply with the value 0. A state query has no such reply, and shows the echo."""
+    """The echo of a value query equals its reply with the value 0.
+
+    The reply to a state query never equals its request, so it first shows that the adapter echoes.
+    """
     state, ask_state = b":010300030000000007\r\n", b":010300000000000004\r\n"
     value, ask_value = b":010701F40000138898\r\n", b":010701F400000000FD\r\n"
     assert line.send(exchange(Message(1, 3, 0, data=words(0, 0)), framing=Framing.DELIXI)) == ask_state
@@ -747,7 +756,7 @@ def receive_at_pace(line: LineDriver, begin: int, frame: bytes) -> None:
             line.now = line.wake
 
 
-def test_a_delixi_value_of_0_ends_the_exchange_if_it_is_due(line: LineDriver, steady: Peer) -> None:
+def test_a_delixi_value_of_0_is_accepted_at_the_drives_usual_delay(line: LineDriver, steady: Peer) -> None:
     """An echo would have come earlier, so this copy of the request is the reply."""
     make_steady(line, steady)
     for _ in range(5):
@@ -758,8 +767,10 @@ def test_a_delixi_value_of_0_ends_the_exchange_if_it_is_due(line: LineDriver, st
 
 
 @pytest.mark.parametrize("insists", [False, True])
-def test_a_copy_that_may_be_an_echo_ends_at_timeout(line: LineDriver, steady: Peer, insists: bool) -> None:
-    """The copy came too early for a reply, or the read has `insists`, which ignores arrival times."""
+def test_a_possible_echo_is_accepted_as_reply_only_at_the_timeout(
+    line: LineDriver, steady: Peer, insists: bool
+) -> None:
+    """A copy of the request came too early for a reply. With `insists`, no arrival time is compared."""
     make_steady(line, steady)
     end = send_query(line, steady, insists=insists)
     if insists:
@@ -772,7 +783,9 @@ def test_a_copy_that_may_be_an_echo_ends_at_timeout(line: LineDriver, steady: Pe
 
 
 @pytest.mark.parametrize("later", [0, 10 * MS, TIMEOUT // 2])
-def test_a_steady_drives_first_echo_is_not_a_value_of_0(line: LineDriver, steady: Peer, later: int) -> None:
+def test_an_echo_before_the_usual_delay_is_not_a_value_of_0(
+    line: LineDriver, steady: Peer, later: int
+) -> None:
     make_steady(line, steady)
     end = send_query(line, steady)
     line.receive(ECHO)
@@ -788,8 +801,8 @@ def test_after_two_copies_of_a_value_of_0_it_is_unknown_whether_the_adapter_echo
     assert line.echo == lib.MD_ECHO_UNKNOWN
 
 
-def test_coils_equal_to_their_request_are_accepted_at_the_timeout(line: LineDriver) -> None:
-    """The reply to a read of 17 coils from 03xxH has its request's length and first three bytes."""
+def test_a_coils_reply_that_looks_like_an_echo_is_accepted_at_the_timeout(line: LineDriver) -> None:
+    """The reply to a read of 17 coils from address 0320H can have the same bytes as the request."""
     copy = rtu("01 01 03 20 00 11")
     exchanged(line, reply_of(1))
     for reply in (copy, copy + rtu("01 01 03 55 55 01")):

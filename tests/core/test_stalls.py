@@ -234,7 +234,7 @@ def test_a_port_is_lost_if_its_adapter_holds_a_command_until_the_timeout(port: P
     assert (port.lost, port.lost_error, port.called_off) == (True, errno.ETIMEDOUT, True)
 
 
-def test_a_command_that_the_adapter_has_accepted_does_not_lose_the_port(free_port: Port) -> None:
+def test_a_port_is_not_lost_if_its_adapter_accepted_the_command(free_port: Port) -> None:
     assert free_port.carry_out(exchange(START, baudrate=9600)).result == Failure.NO_REPLY
     assert (free_port.is_stalled, free_port.lost, free_port.called_off) == (False, False, False)
 
@@ -281,7 +281,7 @@ def test_a_wrong_count_of_unsent_bytes_does_not_delay_other_drives(ends: Ends, p
         for request in requests[:2]:
             assert port.carry_out(patient(request)).result > 0
         assert port.carry_out(exchange(SILENT, timeout=0.2)).result == Failure.NO_REPLY
-        assert port.carry_out(patient(READ)).result > 0  # sent after a second
+        assert port.carry_out(patient(READ)).result > 0  # sent after a wait of 1 s for the unsent bytes
         assert port.carry_out(exchange(SILENT, timeout=0.2)).result == Failure.NO_REPLY
     assert (port.miscounts, port.is_stalled) == (True, False)
 
@@ -323,8 +323,8 @@ def test_a_stop_does_not_wait_for_an_outdated_count_of_unsent_bytes(ends: Ends, 
     assert not port.miscounts
 
 
-def test_close_behind_does_not_wait_for_a_stalled_far_end() -> None:
-    """A TCP connection that lingers for 60 s waits while it is closed, as a serial port does."""
+def test_a_port_closes_without_waiting_for_a_stalled_far_end() -> None:
+    """The test uses a TCP connection: with a linger time of 60 s, its `close` blocks like a serial port's."""
     handled: list[int] = []
     before = signal.signal(signal.SIGRTMAX, lambda number, frame: handled.append(number))
     try:

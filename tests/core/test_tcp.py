@@ -242,7 +242,7 @@ def test_a_request_is_sent_immediately_although_a_late_reply_is_due(line: LineDr
 
 def test_the_timeout_adapts_to_the_delay_of_a_late_tcp_reply(line: LineDriver, drive: Peer) -> None:
     late = miss(line, drive)
-    sent = line.completion.sent_ns + 8 * CHARACTER  # plus the time on the serial line behind the gateway
+    sent = line.completion.sent_ns + 8 * CHARACTER  # end of the request on the gateway's serial line
     for _ in range(30):
         miss(line, drive)
     line.now = sent + 2000 * MS
@@ -265,7 +265,7 @@ def test_a_gateways_exception_counts_as_no_reply(line: LineDriver, drive: Peer, 
     assert drive.failures == 0
 
 
-def test_a_gateways_late_exception_is_not_counted_as_a_late_reply(line: LineDriver, drive: Peer) -> None:
+def test_an_exception_from_the_gateway_is_not_the_drives_late_reply(line: LineDriver, drive: Peer) -> None:
     late = miss(line, drive)
     line.receive(tcp(late, bytes([1, 0x83, 0x0B])))
     assert drive.failures == 1
@@ -281,7 +281,7 @@ def test_a_gateways_late_exception_is_not_counted_as_a_late_reply(line: LineDriv
         (bytes([1, 3, 2, 0, 7, 0]), FrameFault.BAD_LENGTH),
     ],
 )
-def test_an_exchange_with_a_wrong_reply_of_its_id_ends_at_the_timeout(
+def test_an_exchange_ends_at_the_timeout_after_a_wrong_reply_with_the_right_id(
     line: LineDriver, drive: Peer, body: bytes, result: FrameFault
 ) -> None:
     transaction = ask(line, drive)
@@ -437,13 +437,17 @@ def gateway() -> LineDriver:
     return LineDriver(Transactions.IGNORED)
 
 
-def test_with_ignored_ids_a_reply_with_another_id_is_accepted(gateway: LineDriver, drive: Peer) -> None:
+def test_a_reply_with_another_id_is_accepted_if_transaction_ids_are_ignored(
+    gateway: LineDriver, drive: Peer
+) -> None:
     for raw in range(10):
         line = gateway
         assert line.data_after(value((ask(line, drive) + 1) & 0xFFFF, raw)) == words(raw)
 
 
-def test_with_ignored_ids_a_late_reply_delays_the_next_request(gateway: LineDriver, drive: Peer) -> None:
+def test_a_late_reply_delays_a_request_if_transaction_ids_are_ignored(
+    gateway: LineDriver, drive: Peer
+) -> None:
     miss(gateway, drive)
     gateway.begin(exchange(READ, drive))
     assert gateway.completion.result == Failure.LATE_ANSWER_DUE
@@ -455,7 +459,9 @@ def test_with_ignored_ids_a_late_reply_delays_the_next_request(gateway: LineDriv
     assert gateway.completion.reply.data == words(2)
 
 
-def test_with_ignored_ids_a_drive_may_reply_after_an_exception(gateway: LineDriver, drive: Peer) -> None:
+def test_a_late_reply_may_follow_an_exception_if_transaction_ids_are_ignored(
+    gateway: LineDriver, drive: Peer
+) -> None:
     gateway.receive(tcp(ask(gateway, drive), bytes([1, 0x83, 0x0B])))
     assert gateway.completion.result == Failure.NO_REPLY
     assert drive.late_until_ns > gateway.now
@@ -470,7 +476,9 @@ def ends() -> Iterator[tuple[socket.socket, socket.socket]]:
         yield ours, theirs
 
 
-def test_other_bytes_end_a_connection_as_lost(ends: tuple[socket.socket, socket.socket], drive: Peer) -> None:
+def test_a_tcp_connection_is_lost_if_bytes_of_another_protocol_arrive(
+    ends: tuple[socket.socket, socket.socket], drive: Peer
+) -> None:
     ours, theirs = ends
     port = Port(ours.fileno(), -1, transactions=Transactions.MATCHED)
     try:

@@ -80,7 +80,7 @@ def test_a_late_reply_on_a_reopened_port_is_not_read_as_another_register(
         assert bus.peer(pump).late >= 1  # a busy computer may make another reply late
 
 
-def test_a_late_reply_on_a_reopened_port_is_not_polled_as_another_register(wire: HoldingWire) -> None:
+def test_no_polled_value_comes_from_a_late_reply_on_a_reopened_port(wire: HoldingWire) -> None:
     leave_a_reply_behind(wire, wire.path)
     drive = QuickToy(1, name="pump")
     values: set[float] = set()

@@ -125,7 +125,7 @@ def test_frames_are_logged_only_at_level_debug(caplog: pytest.LogCaptureFixture)
     assert "Message(address=1, function=3" in reply
 
 
-def test_log_names_every_write_refusal_and_stop(caplog: pytest.LogCaptureFixture) -> None:
+def test_every_write_every_refusal_and_every_stop_is_logged(caplog: pytest.LogCaptureFixture) -> None:
     _, drive, _ = one(InvtCHE(1, name="pump-1", maximum_frequency=50))
     bus: Any = drive.bus
     with caplog.at_level(logging.INFO, "multidrop"):

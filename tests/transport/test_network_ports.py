@@ -386,7 +386,9 @@ def start_into_the_cut(bus: Bus, toy: Toy, network: FarNetwork) -> None:
 
 @pytest.mark.long
 @pyserials_own
-def test_a_start_into_a_cut_network_never_arrives_after_the_port_is_closed(far_network: FarNetwork) -> None:
+def test_a_start_during_a_network_failure_never_arrives_after_the_port_closes(
+    far_network: FarNetwork,
+) -> None:
     with Bus(far_network.url, echo="off", expiry=PATIENCE) as bus:
         start_into_the_cut(bus, bus.attach(Toy, 1), far_network)
     taken = far_network.all_received()
@@ -397,7 +399,9 @@ def test_a_start_into_a_cut_network_never_arrives_after_the_port_is_closed(far_n
 @pytest.mark.slow
 @pyserials_own
 @pytest.mark.skipif(not hasattr(socket, "TCP_USER_TIMEOUT"), reason="this system knows no such time-out")
-def test_a_start_into_a_cut_network_never_arrives_while_the_port_is_open(far_network: FarNetwork) -> None:
+def test_a_start_during_a_network_failure_never_arrives_while_the_port_is_open(
+    far_network: FarNetwork,
+) -> None:
     """The network is restored as soon as the call has returned."""
     with Bus(far_network.url, echo="off", expiry=PATIENCE) as bus:
         start_into_the_cut(bus, bus.attach(Toy, 1), far_network)

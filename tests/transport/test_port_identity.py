@@ -204,7 +204,7 @@ def test_a_new_pseudo_terminal_with_a_used_number_is_not_opened(tmp_path: Path, 
                 stack.callback(os.close, end)
         if is_replaced:
             link.unlink()
-            link.symlink_to(later[-1])  # usually the same number
+            link.symlink_to(later[-1])  # the new pseudo-terminal usually has the number of the closed one
             found.reopen()
             found.close()
         else:
@@ -358,7 +358,9 @@ def test_closing_a_stalled_port_takes_limited_time_without_free_descriptors(
     assert not port.is_open
 
 
-def test_a_lost_port_states_why_before_it_is_reopened(terminal: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_reason_of_a_loss_is_known_before_the_port_is_reopened(
+    terminal: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     found = Line(terminal).open()
     core = SimpleNamespace(lost=True, lost_error=0, called_off=True, is_stalled=False, stop=lambda: None)
     found.queue = core  # type: ignore[assignment]
@@ -384,7 +386,7 @@ def test_reads_reopen_a_port_that_was_closed_to_discard_a_command() -> None:
         (1, f"the request was sent only in part: the port took no bytes until the time-out ({STALLED})"),
     ],
 )
-def test_a_command_that_a_stalled_port_does_not_send_is_not_logged_as_a_loss(
+def test_a_stalled_port_is_not_logged_as_lost_after_an_unsent_command(
     sent_ns: int, said: str, terminal: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     found = Line(terminal).open()

@@ -332,7 +332,7 @@ def test_a_read_is_whole_or_names_the_refused_register(refused: set[int], most: 
     bus = SimulatedBus(Picky(drive, refused, most)).bus
     bus.attach(drive)
     registers = [drive.register(f"r{at}") for at in sorted(asked)]
-    for _ in range(2):  # the second read starts with the parts
+    for _ in range(2):  # the second read knows the smaller blocks of the first
         if not refused & asked:
             assert drive.read_many(registers) == expected_values(asked)
             continue
@@ -379,7 +379,7 @@ def test_a_dead_drive_gets_only_one_additional_shorter_request() -> None:
     sim.silent_beyond = 125
     assert drive.read_many(drive.registers.values()) == expected_values(range(WIDE))
     sim.asked.clear()
-    sim.silent_beyond = 1  # the drive has answered the block before: not split
+    sim.silent_beyond = 1  # the drive once answered the whole block, so the block is not split
     with pytest.raises(NoReply):
         drive.read_many(drive.registers.values())
     assert sim.asked == [(0, WIDE)] * 3

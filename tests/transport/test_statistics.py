@@ -92,7 +92,7 @@ def test_the_utilisation_of_a_port_above_its_baud_rate_is_at_most_1(line: LineDr
         line.now += MS // 10
         line.receive(reply())
         line.wait_until_done()
-    line.now += 8 * CHARACTER  # the time of the last request at its baud rate
+    line.now += 8 * CHARACTER  # duration of the last request on the wire
     found = Statistics((line.now - begun) / 1e9, drive.counters())
     assert found.samples == 100
     assert 0.9 < found.utilisation <= 1.0 + 1e-9
@@ -194,7 +194,7 @@ def test_since_returns_the_difference_between_two_statistics() -> None:
     assert found.drives["pump"].utilisation == 0.5
 
 
-def test_since_derives_the_longest_delay_from_the_buckets() -> None:
+def test_the_longest_delay_of_a_time_span_is_derived_from_the_buckets() -> None:
     early, late = counters_of([50 * MS]), counters_of([50 * MS, 8 * MS])
     found = line_of(2, pump=late).since(line_of(1, pump=early)).delays
     assert 8e-3 <= found.longest <= 8e-3 * 9 / 8  # the end of the bucket that has 8 ms

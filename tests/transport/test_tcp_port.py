@@ -294,7 +294,7 @@ def test_exception_0b_of_a_gateway_raises_no_reply() -> None:
 
 
 @pytest.mark.parametrize("kind", ["socket", "tcp"])
-def test_mixed_up_recognises_only_frames_of_the_other_protocol(kind: str) -> None:
+def test_only_frames_of_the_other_protocol_are_recognised_as_mixed_up(kind: str) -> None:
     port = f"{kind}://10.0.0.7:502"
     rtu, tcp = build_request(Framing.RTU, READ), build_request(Framing.TCP, READ)
     own, other = (rtu, tcp) if kind == "socket" else (tcp, rtu)

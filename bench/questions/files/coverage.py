@@ -41,11 +41,11 @@ def load(folder: Path) -> tuple[list[ImportedDevice], list[str]]:
 
 
 class Coverage:
-    """Counts the entries of devices that the library can represent."""
+    """Counts the registers of imported devices, and how many of them the library can represent."""
 
     def __init__(self, devices: Iterable[ImportedDevice]) -> None:
         self.by_device = [(device, holdings(device)) for device in devices]
-        # reason: devices whose entries a family can declare one by one, but not all together
+        # numbers of devices by reason: a family can declare each of their entries, but not all in one class
         self.refused = Counter[str]()
         self.whole = sum(self._is_whole(entries) for _, entries in self.by_device)
 
@@ -62,7 +62,7 @@ class Coverage:
         return [entry for _, entries in self.by_device for entry in entries]
 
     def needed(self) -> Iterator[tuple[str, int, int]]:
-        """Yield each detail, the number of entries that need it, and how many of them are representable."""
+        """Yield each detail in words, how many entries have it, and how many of these can be declared."""
         for key, words in DETAILS.items():
             needing = [entry for entry in self.entries if key in entry.details]
             yield words, len(needing), sum(entry.is_whole for entry in needing)
@@ -77,7 +77,7 @@ class Coverage:
         yield from ((reason, count, devices[reason]) for reason, count in entries.most_common())
 
     def besides(self) -> Iterator[tuple[str, int]]:
-        """Yield each remark of the importers on representable entries, with its number of occurrences."""
+        """Yield each warning of the importers about entries that can be declared, and how often it occurs."""
         said = Counter(
             _DETAIL.sub("N", gap) for entry in self.entries if entry.entry for gap in entry.entry.gaps
         )
@@ -96,7 +96,7 @@ def _lack(entry: Holding) -> str:
 
 
 def report(coverage: Coverage, unread: list[str]) -> None:
-    """Print the shares of representable entries and devices, needed details, and reasons for rejection."""
+    """Print how many entries and devices can be declared, which details they need, and why others fail."""
     entries, devices = coverage.entries, len(coverage.by_device)
     held = sum(entry.is_whole for entry in entries)
     readable = sum(entry.is_held for entry in entries)

@@ -39,7 +39,7 @@ from multidrop.recording.segments import SegmentWriter
 SECOND = 1_000_000_000
 SEGMENT_S = 600
 MIDNIGHT = 1_795_219_200 * SECOND  # 2026-11-21
-FULL_S = 3600  # s from the start of the day in which rows are at 10 Hz
+FULL_S = 3600  # seconds after midnight until which a register has 10 rows per second, then one
 DRIVES, REGISTERS = 31, 10
 UNIT = "Hz"
 DESCRIBED = {f"value_{number}": {"unit": UNIT} for number in range(REGISTERS)}
@@ -91,12 +91,8 @@ def make_day(folder: Path, hours: int) -> None:
             f"a segment of {SEGMENT_S} s: {size / 1e6:.1f} MB as .arrows; compacted by a process with",
             end=" ",
         )
-        words = [
-            sys.executable,
-            "-c",
-            COMPACTED,
-            str(folder),
-        ]  # a small process in between, because it reports its child's greatest memory
+        # a small process starts the compaction, and measures the greatest memory of this child alone
+        words = [sys.executable, "-c", COMPACTED, str(folder)]
         print(subprocess.run(words, check=True, capture_output=True, text=True).stdout.strip())
         segments = hours * 3600 // SEGMENT_S
         for number in range(2, segments + 1):

@@ -23,7 +23,7 @@ def meter(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_file_of_40_registers(benchmark: Any, meter: Path) -> None:
+def test_load_a_40_register_file(benchmark: Any, meter: Path) -> None:
     def load() -> None:
         loader._loaded.clear()
         loader.load_family(meter)
@@ -31,7 +31,7 @@ def test_a_file_of_40_registers(benchmark: Any, meter: Path) -> None:
     benchmark(load)
 
 
-def test_a_meter(benchmark: Any) -> None:
+def test_load_a_meters_file(benchmark: Any) -> None:
     path = Path(__file__).parents[3] / "tests/data/families/sdm630.toml"
 
     def load() -> None:
@@ -41,6 +41,6 @@ def test_a_meter(benchmark: Any) -> None:
     benchmark(load)
 
 
-def test_the_same_file_again(benchmark: Any, meter: Path) -> None:
+def test_load_the_same_file_again(benchmark: Any, meter: Path) -> None:
     loader.load_family(meter)
     benchmark(loader.load_family, meter)

@@ -56,7 +56,7 @@ def main() -> None:
     own = [line for line, gateway in shares.items() if gateway == REAL]
 
     def run(words: Sequence[str]) -> Seen:
-        """Poll all lines with the `multidrop` command `words` for a while; return the results."""
+        """Run `multidrop` with these arguments, which poll all lines, for a while; return the results."""
         log, command = Path(folder) / "log", [sys.executable, "-m", "multidrop", *words]
         with log.open("wb") as output, subprocess.Popen(command, stdout=output, stderr=output) as process:
             try:

@@ -85,7 +85,7 @@ class Chaos:
         return Process(self.folder, name, *words)
 
     def await_told(self) -> None:
-        """Wait until each gateway has noted stored samples, because attacks before that can lose none."""
+        """Wait until each gateway has reported stored samples: only reported samples are looked for later."""
         ends = time.monotonic() + PATIENCE_S
         while not all(sum(runs.values()) for runs in told(self.folder).values()):
             for gateway in self.gateways:
@@ -213,7 +213,10 @@ def _log_of(folder: Path) -> str:
 
 
 def told(folder: Path) -> dict[str, dict[int, int]]:
-    """Return the noted numbers of stored exchanges, by gateway and by the first number of each run."""
+    """Return how many exchanges each gateway has reported as stored, in each of its runs.
+
+    The keys are the gateway and the number of the run's first exchange.
+    """
     found: dict[str, dict[int, int]] = {}
     for name in GATEWAYS:
         runs: dict[int, int] = defaultdict(int)
@@ -248,7 +251,11 @@ def in_postgres(database: Postgres) -> Numbers:
 
 
 def compare(of: dict[str, dict[int, int]], kept: Numbers) -> tuple[int, int, int, int]:
-    """Return the numbers of exchanges that are noted, missing, absent between stored ones, and doubled."""
+    """Compare the exchanges that gateways reported as stored with those that a sink has kept.
+
+    Return four counts: exchanges reported; reported but not kept; not kept although a later exchange of the
+    same run is kept; and kept more than once.
+    """
     missing = holes = 0
     for name, runs in of.items():
         numbers = kept[name]
@@ -281,7 +288,10 @@ def everything(folder: Path, dice: random.Random) -> Iterator[Chaos]:
 
 
 def run(folder: Path, seconds: float, dice: random.Random) -> int:
-    """Attack for `seconds`, compare sinks and notes, print the results, and return the number of errors."""
+    """Attack for `seconds`, compare both sinks with the gateways' reports, and print the results.
+
+    Return the number of exchanges that are lost, missing between others, or doubled.
+    """
     with everything(folder, dice) as chaos:
         chaos.await_told()
         ends = time.monotonic() + seconds

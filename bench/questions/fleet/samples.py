@@ -142,7 +142,7 @@ def messages() -> Iterator[tuple[object, ...]]:
 def stores(folder: Path) -> Iterator[tuple[object, ...]]:
     """Write the same half million rows of 500 lines to each store, in two commits."""
     found = [columns_of(65536, 500, random.Random(seed)) for seed in range(8)]
-    units = units_of(found[0])  # the units in the first message, because all messages have the same drives
+    units = units_of(found[0])  # the same in all messages, because all have the same drives
     sent = [one.data for columns in found for one in packed(columns, units)]
     rows = sum(len(columns.time) for columns in found)
     spool = SpoolFolder(folder / "spool", "gateway-1")

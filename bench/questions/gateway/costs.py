@@ -81,7 +81,7 @@ class FakeTransport(asyncio.Transport):
 
 
 class Worker:
-    """A gateway that is not started, with a method for each kind of its work, for all drives."""
+    """Does each kind of a gateway's work once for all drives; the gateway itself is not started."""
 
     def __init__(self, folder: Path, lines: tuple[int, ...] = LINES) -> None:
         self.plant = Plant.load(write_plant(folder, lines))

@@ -272,9 +272,9 @@ class Hall:
                     yield self.slice("serve, users", gateway, seconds)
 
     def stops(self, rounds: int) -> Iterator[tuple[object, ...]]:
-        """Stop all drives in alternating rounds without and with the users, then beside hostile clients.
+        """Stop all drives while the gateway has no users, while it has users, and under hostile clients.
 
-        Yields a row for each round.
+        Rounds without and with users alternate. Yields a row for each kind of round.
         """
         found: dict[str, list[tuple[float, float, float]]] = {"alone": [], "users": []}
         with serving(self.plant, self.place, self.before) as gateway:

@@ -73,7 +73,7 @@ class Gateway:
         return said
 
     def rows(self) -> Counter[str]:
-        """Return the numbers of values ("") and of missing values, by reason, since the start of polling."""
+        """Return how many values have been polled, under the key "", and how many are missing, by reason."""
         text = self.ask("GET", "/metrics")
         found: Counter[str] = Counter()
         for count in re.findall(r"^multidrop_line_samples_total.* (\S+)$", text, re.M):

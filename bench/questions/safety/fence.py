@@ -38,7 +38,7 @@ def rounds(kind: str, stops: int, lines: int, lease: float, guard: float, seed: 
 
 
 def side_by_side(kind: str, stops: int, details: argparse.Namespace) -> list[Round]:
-    """Distribute `stops` suspensions over processes, which have lines and masters of their own."""
+    """Suspend masters `stops` times, in several processes at once; each process has its own lines."""
     jobs = details.jobs
     shares = [stops // jobs + (job < stops % jobs) for job in range(jobs)]
     with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:

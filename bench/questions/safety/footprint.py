@@ -27,7 +27,7 @@ BAUDRATE = 38400
 DRIVES = 31
 SETTLE_S = 2.0
 
-# By board: clock in GHz, and the assumed instructions per cycle of such code.
+# Clock in GHz, and assumed instructions per cycle of a Python program with a C core, by board.
 BOARDS = {
     "Raspberry Pi Zero W (ARM1176, 1.0 GHz)": (1.0, 0.4),
     "Raspberry Pi 3, Zero 2 W (Cortex-A53, 1.0 GHz)": (1.0, 0.6),

@@ -20,7 +20,7 @@ from bench.support import tables
 TIMEOUT_MS = 5
 LATE_PERMILLE, LOST_PERMILLE, TWICE_PERMILLE = 100, 20, 50
 PATHS_MS = (10, 100, 1000)
-FEW = 4  # number of lines, and of drives on each line
+FEW = 4  # number of lines, and of drives on each line, if the network path is slow
 
 
 def main() -> None:
@@ -69,7 +69,7 @@ def _told(judged: many_adapter.Judged, seconds: float) -> dict[str, object]:
 
 
 def slow_paths(arguments: argparse.Namespace) -> Iterator[tuple[object, ...]]:
-    """Yield a row for each path delay. Lines and drives are few, because exchanges take long."""
+    """Yield a row for each delay of the network path, constant or in stalls."""
     for path_ms in PATHS_MS:
         constant = "--path-us", 1000 * path_ms
         stalls = "--stall-us", 1000 * path_ms, "--stall-every-us", 5000 * path_ms

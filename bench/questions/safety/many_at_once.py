@@ -58,7 +58,7 @@ def plant(ports: Sequence[str], drives: int) -> Plant:
 
 
 def wires(lines: int, drives: int) -> list[Wire]:
-    """Return simulated lines without waits, because all processors are too busy to keep a line's pace."""
+    """Return simulated lines that do not wait as long as a serial line does: the computer is too busy."""
     return [
         Wire(
             [
@@ -176,9 +176,9 @@ class Round:
     # ---- the results ----
 
     def told(self) -> tuple[int, int]:
-        """Return the number of exchanges, and of rows that the summary counts but that were not taken.
+        """Return the number of exchanges, and the number of rows that the poller counts but did not deliver.
 
-        The threads have added all removed drives again by now, so the summary has every drive.
+        Call this after `run`: its threads add every removed drive again, so the summary has all drives.
         """
         summary = self.poller.summary()
         lost = summary["samples"] + summary["misses"] - self.counts["rows"]

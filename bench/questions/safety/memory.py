@@ -22,7 +22,7 @@ from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.settings import ServeSettings, read_settings
 from multidrop.sim import Simulator, Wire, simulated
 
-WARM_UP = 0.02  # share of the exchanges after which buffers have their final size
+WARM_UP = 0.02  # part of all exchanges; afterwards the buffers no longer grow
 ROWS = 10
 DRIVES = 40
 

@@ -39,7 +39,7 @@ PLAYERS = Path(__file__).parents[2] / "players"
 MOST_GROWTH_KB = 2048  # limit for resident memory after the first period
 COMMAND_EVERY = 20.0  # s between the start and the stop of a motor
 IN_FLIGHT = 2  # number of each register's newest reads that may have no row yet
-HELD_UP = 1.0  # s; a wrong value is excused if the line was delayed this soon before it
+HELD_UP = 1.0  # s; a wrong value is excused if the simulator was late within this time before the value
 HEAD: tuple[str, ...] = (
     "hours",
     "exchanges",
@@ -75,7 +75,7 @@ class Span:
 
 @dataclass
 class Period:
-    """The counters of one row of the table."""
+    """The counts of one period, which are one row of the printed table."""
 
     exchanges: int = 0
     values: int = 0
@@ -182,7 +182,7 @@ class Soak:
         return period
 
     def unexplained(self, overrun: int) -> int:
-        """Return how many due values have no row and are not among the `overrun` skipped values."""
+        """Return how many due values have no row; the poller has skipped another `overrun` values."""
         slots = int((time.monotonic() - self.begun) / plants.EVERY) - IN_FLIGHT
         return max(0, sum(max(0, slots - self.slots[key]) for key in self.timed) - overrun)
 

@@ -109,7 +109,7 @@ def race(chance: random.Random, rounds: int, is_long: bool) -> Counters:
 
 
 def deaf(chance: random.Random, rounds: int, is_long: bool) -> Counters:
-    """Request stops while the line answers nothing for a while."""
+    """Call a stop while no drive on the line answers for a while."""
     counters = Counters()
     for _ in range(rounds):
         seconds = chance.uniform(2.0, 20.0) if is_long else 1.2
@@ -127,7 +127,7 @@ def deaf(chance: random.Random, rounds: int, is_long: bool) -> Counters:
 
 
 def two_lines(*, polls: bool) -> Attack:
-    """Return an attack by a signal that must stop the motors of two lines, whose drives stop slowly."""
+    """Return an attack: a signal ends the program, which must stop the slow motors of both its lines."""
 
     def attack(chance: random.Random, rounds: int, is_long: bool) -> Counters:
         counters = Counters()

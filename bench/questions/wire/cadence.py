@@ -61,7 +61,10 @@ MASTERS: dict[str, Callable[[Job], tuple[int, numpy.ndarray]]] = {
 
 
 def work(master: str, job: Job, loops: int) -> None:
-    """Print a master's rate and delays as JSON: first alone, then beside a computing thread or programs."""
+    """Print a master's rate and delays as JSON: first alone, then on a busy computer.
+
+    The load is `loops` busy programs; if `loops` is 0, it is a busy thread of the master's own process.
+    """
     told = {}
     for when in ("alone", "beside"):
         if when == "beside" and not loops:

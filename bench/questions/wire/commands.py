@@ -18,7 +18,7 @@ from bench.support.programs import paced_line
 
 
 def measured(threads: int, baudrate: int, seconds: float) -> dict[str, float]:
-    """Return exchanges per second of polling and of `threads` reading threads, and the longest call in s."""
+    """Poll while `threads` threads read; return both rates per second, and the longest read in s."""
     with paced_line(baudrate=baudrate) as line, adapter.polling(Job(line.path, baudrate, seconds)) as poller:
         bus = poller.bus("line")
         stop, took = threading.Event(), []

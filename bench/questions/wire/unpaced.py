@@ -26,7 +26,9 @@ def measured(master: str, seconds: float, **options: Any) -> dict[str, Any]:
         own = rivals.measure_bare(job, 0) if master == BARE else rivals.measure(master, job)
     good = max(1, own["exchanges"])
     if line.report["answered"] < good:
-        raise AssertionError(f"{master} tells of {good} exchanges, the line of {line.report['answered']}")
+        raise AssertionError(
+            f"{master} reports {good} exchanges, but the line answered {line.report['answered']}"
+        )
     if line.report["registers"] != REGISTERS * line.report["answered"]:
         raise AssertionError(
             f"{master} reads {line.report['registers']} registers with {line.report['answered']} requests"

@@ -36,13 +36,13 @@ COM = 5
 
 
 def here(job: Job, folder: Path) -> dict[str, Any]:
-    """Run a job on this system; return its CPU seconds and misses."""
+    """Run a job on this system; return its CPU seconds and the number of exchanges without values."""
     own = rivals.measure("multidrop", job)
     return {"cpu": own["cpu_seconds"], "misses": own["failures"]}
 
 
 def on_windows(job: Job, folder: Path) -> dict[str, Any]:
-    """Run a job with Wine; return its CPU seconds and misses."""
+    """Run a job with Wine; return its CPU seconds and the number of exchanges without values."""
     link = folder / "wine" / "dosdevices" / f"com{COM}"
     link.unlink(missing_ok=True)
     link.symlink_to(job.port)

@@ -46,7 +46,7 @@ _MOST_PIECES = 1 << 15
 
 
 class Stream:
-    """Bytes of one line in pieces (struct md_stream)."""
+    """The bytes captured on one line, with the time and sender of each piece (struct md_stream)."""
 
     def __init__(self, place: Any = None) -> None:
         self.c = ffi.new("struct md_stream *") if place is None else place
@@ -111,7 +111,7 @@ class Decoder:
         return Framing(self._c.span.framing), from_c(self._c.span.message)
 
     def know(self, block: RowLayout | None) -> bool:
-        """Store the layout of replies to the `asked` request; return False if the table is full.
+        """Store the layout of the replies to the request in `asked`; return False if the table is full.
 
         If `block` is None, the replies to this request make no rows.
         """
@@ -148,7 +148,10 @@ class Unpacked(IntEnum):
 
 
 class Unpacker:
-    """Reads packets from a capture file's bytes (struct md_capture); `at` is its position in the file."""
+    """Reads packets from the bytes of a capture file (struct md_capture).
+
+    `at` is the position in the file of the next byte to read.
+    """
 
     MOST_CHANNELS = 64
 
@@ -163,7 +166,8 @@ class Unpacker:
 
     def look_at(self, piece: bytes, at: int) -> None:
         """Continue with this piece of the file, which starts at byte `at` of the file."""
-        self._c.len = self._c.at = 0  # reset before the assignment below frees the previous piece
+        # the next assignment frees the previous piece, so first the struct is emptied
+        self._c.len = self._c.at = 0
         self._piece, self._begin = ffi.from_buffer("uint8_t[]", piece), at
         self._c.bytes, self._c.len = self._piece, len(piece)
 
@@ -232,7 +236,7 @@ class Tap:
         return int(self.c.lost)
 
     def take(self, wrappings: Wrappings, interface: int, utc_minus_monotonic_ns: int) -> Iterator[bytes]:
-        """Yield all bytes of the ring as pcapng packets of this interface; each item has many packets."""
+        """Yield all bytes of the ring as pcapng packets of this interface, many packets at a time."""
         if self.c.put == self.c.taken:
             return
         out = self._out = self._out or ffi.new("uint8_t[]", _TAKEN)

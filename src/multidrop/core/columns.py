@@ -54,9 +54,10 @@ _MAY_LACK = frozenset(
 
 
 def raw_value(data: bytes, at: int, number_format: int) -> float:
-    """Return the number at the 16-bit word (BIT: the bit) `at` of a reply's data; NaN if data is missing.
+    """Return one number from a reply's data; NaN if the data is too short.
 
-    `number_format` includes the order flags.
+    `at` is the index of the number's first 16-bit word, or of the bit if the format is BIT. `number_format`
+    includes the order flags.
     """
     return float(lib.md_value(data, len(data), at, number_format))
 

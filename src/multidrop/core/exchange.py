@@ -293,10 +293,10 @@ class Peer:
         self.c.proofs, self.c.proof_count = self._c_proofs, len(self.proofs)
 
     def doubt_first_reply(self) -> None:
-        """Distrust the peer's first reply, which may answer another process's request.
+        """Do not accept the drive's first reply, which may answer another process's request.
 
-        The core then sends a proof (see `prove_by`) and repeats the read. If the peer has no proofs, its
-        first reply is accepted.
+        After that reply, the core first sends one of the reads given to `prove_by`, and then repeats the
+        request. If there are no such reads, the first reply is accepted.
         """
         self.c.is_doubted = True
 

@@ -177,7 +177,10 @@ class _Engine:
             return self._c
 
     def set_realtime(self, client: Realtime, wanted: bool) -> None:
-        """Run the thread under realtime scheduling while any client wants it. Raises OSError if refused."""
+        """Give the core's thread realtime scheduling while any client wants it.
+
+        Raises OSError if the system refuses.
+        """
         with self._changing:
             was_wanted = bool(self._realtime)
             (self._realtime.add if wanted else self._realtime.discard)(client)
@@ -201,7 +204,7 @@ class _Engine:
         with self._changing:
             nice = os.getpriority(os.PRIO_PROCESS, thread)
             if not self._realtime or os.sched_getscheduler(thread) & ~os.SCHED_RESET_ON_FORK:
-                return  # a client has just closed, or the program has chosen another scheduling
+                return  # no client wants realtime scheduling now, or this thread has another scheduling
             self._nice[thread] = nice
             if nice > NICE:
                 os.sched_setscheduler(thread, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))
@@ -399,9 +402,9 @@ def _stop(port: Any, memory: _PortMemory) -> None:
 class Port:
     """A descriptor on which the core's thread carries out exchanges (struct md_port).
 
-    `must_take` is the mask (of REFUSALS) of the settings that the port must not refuse; -1 means a port
-    without settings. `room` is the length of the queue, a power of two. `transactions` is NONE unless all
-    exchanges are Modbus TCP. With a `mastership`, requests are sent only before its deadline.
+    `must_take` is a mask (of REFUSALS): the settings that the port must not refuse. It is -1 for a port that
+    has no settings, such as a socket. `room` is the length of the queue, a power of two. `transactions` is
+    NONE for every framing except Modbus TCP. With a `mastership`, requests are sent only before its deadline.
 
     Raises OSError if the descriptor cannot be polled.
     """
@@ -497,7 +500,7 @@ class Port:
     close = stop
 
     def report_to(self, row_queue: RowQueue, number: int) -> None:
-        """Deliver rows to `row_queue`, and call its client with `number` when the port needs attention.
+        """Deliver rows to `row_queue`; its `await_calls` returns `number` when the port needs attention.
 
         The port needs attention if its queue runs low, the port is lost or has stopped repeating, or a drive
         refuses a request, does not answer, or answers again.
@@ -508,8 +511,7 @@ class Port:
     def repeat(self, exchanges: Sequence[Exchange]) -> int:
         """Carry out these exchanges in turn, whenever no queued exchange is due, until the next call.
 
-        Return the index, among the earlier exchanges, of the one that would have come next; 0 on a closed
-        port.
+        Return which of the previous exchanges would have come next, as an index; 0 on a closed port.
         """
         if self.c is None:
             return 0
@@ -551,7 +553,7 @@ class Port:
         """Carry out an exchange before all queued ones, wait for it, and return its completion.
 
         Reuse the completion `into` if it has room for the values. The request is not sent after
-        `expires_ns` (CLOCK_BOOTTIME; 0: no limit), nor after a stop that ends its permit.
+        `expires_ns` (CLOCK_BOOTTIME; 0: no limit), nor after a stop has revoked the exchange's permit.
         """
         self._memory.lasting.add(exchange.peer)  # keep the peer: a late reply may still come
         found = into if into is not None and into.room == exchange.room else Completion(room=exchange.room)

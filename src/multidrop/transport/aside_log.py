@@ -28,8 +28,8 @@ class AsideThread:
     def forked(self) -> None:
         self._work: SimpleQueue[Callable[[], object]] = SimpleQueue()
         self._begun = threading.Lock()  # locked once the thread was started, by the first `put`
-        # The newest call of `flush` that timed out, and its timeout in s. Its queue gets an item once the
-        # work that was queued before that call is done.
+        # A queue and the timeout in s of the newest `flush` that timed out; None if none did. The queue is
+        # empty until the work that was waiting at that `flush` is done.
         self._late: tuple[SimpleQueue[None], float] | None = None
 
     def put(self, work: Callable[[], object], most: int = MOST_WAITING) -> None:

@@ -72,7 +72,7 @@ def refusal_of(drive: Drive, code: int, register: str | None = None) -> DriveExc
 
 
 def no_value(drive: Drive, found: dict[str, Any]) -> NoValue:
-    """Return NoValue for the first register in `found` without a value; it contains the valid values."""
+    """Return the error for the first register without a value; the error also has the valid values."""
     known = {name: value for name, value in found.items() if value is not None}
     return NoValue(drive.name, next(name for name in found if name not in known), known)
 
@@ -174,9 +174,12 @@ class Exchanges:
     ) -> dict[str, Any]:
         """Return the values of these registers (Register objects or names), by name.
 
-        Each block is tried up to `attempts` times. With `insists`, each request is sent immediately, even if
-        a late reply could be mistaken for its reply; on a slow connection, wait up to `timeout` seconds. If
-        the drive does not answer a block as a whole, the block is read in parts until the port is reopened.
+        Each block is tried up to `attempts` times. If the drive does not answer a whole block, its parts are
+        read instead. Later calls then read the parts at once, until the port is reopened.
+
+        With `insists`, each request is sent immediately, even if a late reply could be mistaken for its
+        reply. On a slow connection, such a request waits up to `timeout` seconds for its reply.
+
         Raises NoValue if a register holds no value, and TextWanted if one of `registers` is a text.
         """
         prepared = self._prepare(drive)
@@ -363,12 +366,15 @@ class Exchanges:
         timeout: float = WRITE_TIMEOUT,
         permit: Permit | None = None,
     ) -> Completion:
-        """Wait until no late reply can come, then send a write once, before queued polling.
+        """Send a write once, before queued polling, as soon as no late reply can be mistaken for its reply.
 
-        The write is not sent after `expires_ns` (CLOCK_BOOTTIME; 0: no limit), or if `permit` has ended. The
-        call waits for the reply at least `timeout` seconds. With `insists`, the call does not wait for late
-        replies; on a slow connection, it waits up to `timeout` seconds for the write's own reply. Raises
-        NoReply without sending if late replies are due and the drive is silent.
+        The write is not sent after `expires_ns` (CLOCK_BOOTTIME; 0: no limit), or after a stop has revoked
+        `permit`. Then the call waits at least `timeout` seconds for the reply.
+
+        With `insists`, the write is sent without waiting for late replies. On a slow connection, the call
+        then waits up to `timeout` seconds for the write's reply.
+
+        Raises NoReply, and sends nothing, if late replies are due and the drive is silent.
         """
         made = make_exchange(
             drive, request, self.peers.of(drive), NO_ROWS, insists=insists, timeout=timeout, permit=permit

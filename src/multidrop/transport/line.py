@@ -185,7 +185,8 @@ class Line:
         self._why_lost: str | None = None
         # why calls fail although the line is not closed yet; None: they do not fail
         self.why_closing: str | None = None
-        # When polling ended; None: not yet. Stalled adapters of several lines then have the same CLOSING_S.
+        # When polling ended; None: not yet. Closing waits for a stalled adapter until CLOSING_S after this
+        # time, so several stalled lines that close in turn delay the end no longer than one.
         self.ended_ns: int | None = None
         self._make_locks()
         register_at_fork(self)
@@ -444,7 +445,10 @@ class Line:
         self._log.note_stall(self.is_stalled)
 
     def note_news(self) -> None:
-        """Log a wrong count of unsent bytes, and on a line with a mastership another master's bytes."""
+        """Log that the driver counts unsent bytes wrongly, or that another master has sent bytes.
+
+        Another master's bytes are noticed only on a line with a mastership.
+        """
         core = self.queue
         if core is None:
             return

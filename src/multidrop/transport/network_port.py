@@ -382,6 +382,9 @@ class Bridge:
 
 
 def _is_fresh(stamps: list[tuple[int, int, bytes]]) -> bool:
-    """Return True if the request is at most MOST_AGE s old, and the clock was not changed since then."""
+    """Return True if the request's timestamp is at most MOST_AGE s from the present time.
+
+    It is farther away if the request is old, or if the clock was set after the request was sent.
+    """
     written = [_TIMESPEC.unpack(stamp) for _, kind, stamp in stamps if kind == _SO_TIMESTAMPNS]
     return any(abs(time.time() - seconds - ns / 1e9) <= MOST_AGE for seconds, ns in written)

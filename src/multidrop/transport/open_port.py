@@ -378,7 +378,7 @@ class OpenPort:
         if self.bridge:
             self.bridge.forget()
             self.bridge = None
-        # Close only a network port's socket: pyserial would also end the connection, which the parent uses.
+        # the parent uses a network port's connection, which pyserial would end: close only its socket here
         port = connection_of(self._serial) or self._serial
         if port:
             with suppress(*PORT_FAILURES):

@@ -1,4 +1,7 @@
-"""Keep each drive's learnt timing and late replies (its peer), even while the drive is off the line."""
+"""Keep the core's record (`Peer`) of each drive, even while the drive is off the line.
+
+The record has the learnt timing, and the requests to which late replies may still come.
+"""
 
 from __future__ import annotations
 
@@ -15,12 +18,12 @@ from multidrop.transport import clock, port_identity
 from multidrop.transport.line import Line
 from multidrop.transport.prepared import NO_ROWS, make_exchange
 
-# how long former peers are kept; late.c remembers outstanding requests for the same time
+# how long the records of a closed port's drives are kept; late.c expects late replies for the same time
 KEPT_NS = 120_000_000_000
 
 
 class FormerPeers(NamedTuple):
-    """Peers whose late replies were still due when their port was closed, each with its address."""
+    """Records of drives whose late replies were still due when their port was closed, with addresses."""
 
     closed_ns: int
     peers: tuple[tuple[int, Peer], ...]
@@ -46,7 +49,10 @@ def _made_ns(device: str) -> int:
 
 
 def remember_former_peers(names: Iterable[str], peers: Iterable[tuple[int, Peer]]) -> None:
-    """Remember a closed port's peers (with addresses) that have late replies due, under the port's names."""
+    """Keep the records of a closed port's drives that have late replies due, under each name of the port.
+
+    `peers` are pairs of a drive's address and its record.
+    """
     now_ns = clock.now_ns()
     for name, former in [*_former.items()]:
         if now_ns - former.closed_ns > KEPT_NS:
@@ -57,7 +63,7 @@ def remember_former_peers(names: Iterable[str], peers: Iterable[tuple[int, Peer]
 
 
 def former_at(names: Iterable[str], address: int) -> Iterator[Peer]:
-    """Yield the peers at this address whose late replies were still due when the port was closed."""
+    """Yield the records of drives at this address whose late replies were due when the port was closed."""
     for name in names:
         former = _former.get(name)
         yield from (peer for at, peer in former.peers if at == address) if former else ()
@@ -68,13 +74,18 @@ LEAST_TIMEOUT = 0.02  # s; time allowed at least for a reply, because computer a
 
 
 class Peers:
-    """The peers of the drives on one line. Threads may read the peers while one thread changes them."""
+    """The core's records of the drives on one line.
+
+    Threads may read the records while one thread adds or removes a drive.
+    """
 
     def __init__(self, line: Line) -> None:
         self._line = line
-        self.present: dict[Drive, Peer] = {}  # peers of the drives that are on the line now
-        self._asked: dict[object, Peer] = {}  # the peer of each exchange that a thread is carrying out
-        # Peers of present and removed drives, by the drive's address and description.
+        self.present: dict[Drive, Peer] = {}  # records of the drives that are on the line now
+        self._asked: dict[
+            object, Peer
+        ] = {}  # the drive's record, for each exchange that a thread is carrying out
+        # Records of present and removed drives, by the drive's address and description.
         self._known: dict[tuple[int, *tuple[object, ...]], Peer] = {}
 
     def add(self, drive: Drive) -> None:
@@ -90,7 +101,7 @@ class Peers:
         least = min(drive.response_timeout, documented)
         asked_as = type(drive), drive.framing, drive.settings, silence(drive), least, drive.response_timeout
         key = drive.address, *asked_as
-        # never replaced: the core may still read the known peer's list of proofs
+        # a known record is used again and never replaced: the core may still read its list of proofs
         if key not in self._known:
             self._known[key] = self._new(drive, least)
         peer = self.present[drive] = self._known[key]
@@ -122,15 +133,15 @@ class Peers:
         return identities_of(self._line.identity, self._line.port)
 
     def remember(self, before: Peers) -> None:
-        """Take over the peers of an earlier bus on the same line."""
+        """Take over the records of an earlier bus on the same line: of its drives and its removed drives."""
         self._known.update(before._known)
 
     def remove(self, drive: Drive) -> None:
-        """Remove a drive from the line, but remember its peer."""
+        """Remove a drive from the line, but keep its record."""
         del self.present[drive]
 
     def of(self, drive: Drive) -> Peer:
-        """Return the drive's peer. Raises NotAttached for a drive that is not on this bus."""
+        """Return the core's record of a drive. Raises NotAttached for a drive that is not on this bus."""
         peer = self.present.get(drive) if isinstance(drive, Drive) else None
         if peer is None:
             check_drive(drive)
@@ -142,7 +153,7 @@ class Peers:
     ) -> Completion:
         """Carry out an exchange on the line. Raises NotAttached if the drive was removed meanwhile."""
         asking = object()
-        # even a signal must not leave an entry in `_asked`: `add` would wait forever until it is removed
+        # even if a signal interrupts, remove the entry from `_asked`: otherwise `add` would wait forever
         try:
             # set before the check, so that `add` of another drive at this address waits for this exchange
             self._asked[asking] = made.peer

@@ -189,14 +189,17 @@ def _name(identity: str) -> bytes:
 
 
 def ledger_of(identity: str, directory: Path) -> Path:
-    """Return the path of a simulated port's EEPROM ledger, kept while its simulator runs."""
+    """Return the path of the file that counts writes to the EEPROMs of the drives on a simulated port.
+
+    The file exists only while the port's simulator runs.
+    """
     return directory / "simulated" / f"{quote(identity, safe='')}.sqlite"
 
 
 class SimulatedPort:
     """Marks a port as simulated until `close`; `is_simulated` finds this mark from any process of the user.
 
-    The EEPROM ledger of the port is deleted when the mark is set and when it is removed.
+    The port's counts of EEPROM writes (see `ledger_of`) are deleted when the mark is set and removed.
     """
 
     def __init__(self, identity: str, directory: Path) -> None:

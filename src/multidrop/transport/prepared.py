@@ -68,7 +68,7 @@ def decoder_of(block: Block) -> BlockDecoder:
 
 
 MOST_PREPARED = 256  # limit of a drive's cached read plans, and of its cached blocks
-# a layout without fields, for commands: the summary of polling does not count their values
+# the rows of an exchange that is not polled: none, so the summary of polling does not count its values
 NO_ROWS = core.RowLayout(0, [])
 
 
@@ -94,7 +94,11 @@ def make_exchange(
 def make_read(
     drive: Drive, block: Block, peer: Peer, rows: core.RowLayout = NO_ROWS, **details: Any
 ) -> Exchange:
-    """Return an exchange that reads a block. It has the drive's echo probe, unless that is in the block."""
+    """Return an exchange that reads a block.
+
+    If the drive has an echo probe (a register whose reply is never a copy of its request), the core can read
+    it first to find out whether the adapter echoes. A block with that register needs no probe.
+    """
     probe, register = None, drive.echo_probe
     if register and register not in block.registers:
         probe = make_exchange(drive, Block.of(drive, [register]).request, peer, NO_ROWS)
@@ -121,10 +125,11 @@ class PreparedRead:
 
 
 class ReadPlan:
-    """The requests that read one list of registers, in reverse order.
+    """The requests that read one list of registers.
 
-    `wanted` are these registers or their names. `only` is the single request that returns them all in this
-    order, or None.
+    `reads` has the last request first, because the caller takes requests from its end. `wanted` has the
+    registers or their names, as the caller gave them. If one request returns all values in the order of
+    `wanted`, it is `only`; otherwise `only` is None.
     """
 
     __slots__ = ("names", "only", "reads", "wanted")
@@ -164,7 +169,7 @@ class PreparedReads:
             return ReadPlan(wanted, registers, tuple(map(prepare, reversed(blocks(drive, registers)))))
 
         self.of = of
-        self.newest = NOTHING  # the plan that was used last; to use it again, no registers are hashed
+        self.newest = NOTHING  # the last plan: a read with the same tuple needs no hash of its registers
         self.prepare = prepare
         # for each block that the drive does not answer as a whole: the smaller blocks to read instead
         self.parts: dict[Block, tuple[Block, ...]] = {}

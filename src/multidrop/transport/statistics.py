@@ -279,7 +279,7 @@ def _middle(counters: Counters, bucket: int) -> float:
 
 
 class Count(NamedTuple):
-    """A reading: the statistics since the line was opened, and the peer of each drive by the drive's name."""
+    """A reading: statistics since the line was opened, and the core's record of each drive by drive name."""
 
     statistics: LineStatistics
     peers: Mapping[str, Peer]
@@ -288,7 +288,8 @@ class Count(NamedTuple):
 class LineMeter:
     """Statistics of a line since it was opened or last reset; frozen when the line is closed.
 
-    A drive's counts at the last reset are found by its peer, because another drive may get its name later.
+    At a reset, each drive's counts are kept with the core's record of the drive, because another drive may
+    get the same name later.
     """
 
     def __init__(self, exchanges: Exchanges) -> None:
