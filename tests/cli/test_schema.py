@@ -270,7 +270,7 @@ def invalid_families() -> list[str]:
     ]
     for rule, _ in FAMILIES.test_mistakes_in_the_parameters_section_are_reported.rows:
         texts.append(f"{head}{reading}[parameters]\n{rule}\n")
-    for section, _ in FAMILIES.test_mistakes_in_identify_or_verb_are_reported.rows:
+    for section, _ in FAMILIES.test_mistakes_in_identify_and_verb_sections_are_reported.rows:
         is_table = section.startswith("[")
         texts.append(FAMILIES.DEVICE + section if is_table else f"{section}\n{FAMILIES.DEVICE}")
     for (

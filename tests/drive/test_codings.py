@@ -294,7 +294,7 @@ def test_a_raw_count_declared_invalid_is_read_as_no_value(
 @table(
     ("number_format", "part", "invalid", "wire"),
     [
-        # a count outside the format's span is compared as a bit pattern
+        # both the bit pattern and the signed number are accepted as the "no value" count
         (NumberFormat.I16, None, 0x8000, "80 00"),
         (NumberFormat.I16, None, -32768, "80 00"),
         (NumberFormat.I32, None, 0x80000000, "80 00 00 00"),
@@ -314,9 +314,9 @@ def test_a_raw_count_declared_invalid_is_read_as_no_value(
         (NumberFormat.BCD16, None, (), "12 3A"),
         (NumberFormat.BCD32, None, (), "F0 00 00 00"),
         (NumberFormat.BCD16, None, 9999, "99 99"),
-        # the invalid count does not fit into bit 0, so it is compared with the whole word
+        # the "no value" count does not fit into bit 0, so it is compared with the whole word
         (NumberFormat.U16, (0, 0), 0xFFFF, "FF FF"),
-        # the invalid count fits into bits 0 to 7, so it is compared with these bits
+        # the "no value" count fits into the register's bits, so it is compared with these bits
         (NumberFormat.U16, (0, 7), 0xFF, "12 FF"),
         (NumberFormat.U16, (8, 15), 0xFF, "FF 12"),
         (NumberFormat.I16, (0, 3), -8, "00 08"),

@@ -87,14 +87,14 @@ def test_a_number_and_a_coil_are_written_without_a_list(meter: BusAndDevice) -> 
     assert device.read_coils(3) == [True]
 
 
-def test_a_start_that_is_no_number_is_refused_in_one_sentence(meter: BusAndDevice) -> None:
+def test_a_start_address_that_is_no_number_is_refused_in_one_sentence(meter: BusAndDevice) -> None:
     _, device = meter
     wrong: Any = "5"
     with pytest.raises(TypeError, match="start = '5' is not a whole number"):
         device.read_holding(wrong)
 
 
-def test_argument_multiple_writes_one_number_with_function_10h(meter: BusAndDevice) -> None:
+def test_one_number_is_written_with_function_10h_if_multiple_is_true(meter: BusAndDevice) -> None:
     line, device = meter
     assert device.write_holding(5, [7], confirm=True, multiple=True) == [7]
     assert device.write_coils(3, [True], confirm=True, multiple=True) == [True]

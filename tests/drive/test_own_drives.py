@@ -249,7 +249,7 @@ def test_setting_can_be_declared_to_move_the_motor() -> None:
     assert len(line.written) == 1
 
 
-def test_plant_file_or_command_line_option_can_confirm_a_drive(tmp_path: Path) -> None:
+def test_plant_file_may_confirm_the_make_of_a_drive(tmp_path: Path) -> None:
     (tmp_path / "pump.py").write_text(
         "from multidrop import Drive, command, reading\n"
         "class Pump(Drive):\n    speed = reading(1)\n    run = command(2)\n"

@@ -265,7 +265,7 @@ def test_state_is_computed_again_for_a_register_value_of_nan() -> None:
     assert len(Counting.looks) == 2
 
 
-def test_state_that_sets_attributes_of_the_drive_is_computed_each_time() -> None:
+def test_state_is_computed_each_time_if_its_method_sets_attributes() -> None:
     reader = StateReader(Noting(1))
     shown = [reader.state({"speed": speed}) for speed in (25.0, 0.0, 0.0, 0.0, 25.0, 0.0, 0.0)]
     assert shown == [RUNS, RUNS, STANDS, STANDS, RUNS, RUNS, STANDS]
@@ -501,7 +501,7 @@ def test_declared_title_takes_precedence_over_catalogue_and_english_titles() -> 
         ([], "en"),
     ],
 )
-def test_first_language_that_has_titles_is_chosen(tags: list[str], language: str) -> None:
+def test_the_first_language_with_register_titles_is_chosen(tags: list[str], language: str) -> None:
     assert chosen_language(tags) == language
 
 

@@ -179,7 +179,7 @@ def test_every_framing_of_a_family_has_character_formats(family: type[Drive]) ->
 
 
 @family
-def test_read_limits_of_a_family_name_only_its_own_tables(family: type[Drive]) -> None:
+def test_read_limits_are_declared_only_for_tables_of_the_family(family: type[Drive]) -> None:
     tables = {register.table for register in family.registers.values()}
     assert {*family.most_registers, *family.readable_gaps} <= tables
 
@@ -227,7 +227,7 @@ def test_named_values_survive_encoding_and_decoding(family: type[Drive], registe
 
 
 @family
-def test_register_declared_with_never_is_not_writable(family: type[Drive]) -> None:
+def test_a_register_is_not_writable_if_it_is_declared_as_never_written(family: type[Drive]) -> None:
     assert not [register for register in family.registers.values() if register.never and register.writable]
 
 
@@ -369,7 +369,7 @@ def test_every_call_of_a_script_uses_yield_from() -> None:
         and isinstance(node.value.value, ast.Call)
     ]
     assert len(carried_out) > 80
-    for node in carried_out:  # check that `forgotten` finds each call once its `yield from` is removed
+    for node in carried_out:  # without its `yield from`, `forgotten` must find the call
         call = node.value.value  # type: ignore[attr-defined]
         assert forgotten(ast.Module([ast.Expr(call)], []), scripts) == [call.lineno]
 

@@ -54,7 +54,7 @@ TABLE = """
 """
 
 
-def test_delixi_native_registers_equal_the_tables_typed_from_part_3() -> None:
+def test_delixi_native_registers_equal_the_tables_of_the_document() -> None:
     own = DELIXI_MONITORS.replace("DelixiModbusFormat", "DelixiNativeFormat")
     shared = "\n".join(f"07/06 {line}" for line in own.strip().splitlines())
     assert rows(DelixiNative) == typed(TABLE + shared)
@@ -266,7 +266,7 @@ def test_table_of_a_delixi_parameter_selects_ram_or_eeprom() -> None:
         setting(parameter(0, 17), "s", table=PARAMETER, kept=Kept.RAM)
 
 
-def test_only_delixi_writes_to_eeprom_are_counted_and_limited(tmp_path: Path) -> None:
+def test_delixi_writes_to_eeprom_are_limited_and_writes_to_ram_are_not(tmp_path: Path) -> None:
     ledger = Ledger(tmp_path / "wear", budget=1000)
     line, drive, sim = one(Owned(1), ledger=ledger)
     for seconds in (1.0, 2.0, 3.0):

@@ -22,7 +22,7 @@ from multidrop.drive.register import COIL, HOLDING, INPUT, Kept
 from multidrop.errors import BadReply, NoReply
 from multidrop.families.erman_er_g_220 import Coil, ErmanERG220, ErmanFault, ErmanStatus, Modes
 
-START_ON = "01 05 00 00 FF 00 8C 3A"  # printed in section 7
+START_ON = "01 05 00 00 FF 00 8C 3A"  # printed in section 7 of the manual
 START_OFF = "01 05 00 00 00 00 CD CA"
 STOP_ON = "01 05 00 01 FF 00 DD FA"
 STOP_OFF = "01 05 00 01 00 00 9C 0A"
@@ -79,7 +79,7 @@ def test_erman_line_settings_and_limits_are_those_of_the_document() -> None:
     assert ErmanERG220.most_registers == {HOLDING: 88, INPUT: 17, COIL: 12}
     assert ErmanERG220.readable_gaps == {HOLDING: range(0x59), INPUT: range(0x1000)}
     assert set(ErmanERG220.exceptions) == {1, 2, 3, 4}
-    # the document's example has this meaning: 01 86 03 02 61
+    # the document explains its example reply 01 86 03 02 61 in this way
     assert "read or write" in ErmanERG220.exceptions[3]
     assert "write" in drive.exception(4)
     assert not ErmanERG220.broadcasts
@@ -141,7 +141,7 @@ def test_erman_fault_must_be_acknowledged_with_the_option(fault: ErmanFault) -> 
     assert wire.sent == []
 
 
-def test_erman_option_acknowledged_fault_allows_a_start() -> None:
+def test_an_erman_starts_after_a_fault_that_its_owner_acknowledged() -> None:
     wire = Wire(
         ErmanERG220(1, acknowledged_fault=64), {**STOPPED, "last_fault": ErmanFault.OVERHEAT}, turns=TURNS
     )
@@ -240,7 +240,7 @@ def test_erman_start_is_refused_if_the_setpoint_is_0_or_was_changed() -> None:
     assert wire.sent == sent
 
 
-def test_error_of_an_erman_start_without_effect_names_the_keypad_setting() -> None:
+def test_error_names_the_keypad_setting_if_an_erman_does_not_start() -> None:
     wire = Wire(ErmanERG220(1), STOPPED)
     with pytest.raises(Unconfirmed, match=r"to run; stop it, or it may start later; b\.001 must be 2"):
         wire.drive.start()

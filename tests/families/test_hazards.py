@@ -3,6 +3,9 @@
 The table has a row for each address that families use differently, and for each error or omission in a
 document that concerns a client. The frame `naive`, printed in the document if possible, must never be sent.
 `sends` has all frames that are sent instead, except reads. Both are without checksums.
+
+A code such as E1 is an erratum of one document: E of the ERMAN ER-G-220, I of the INVT CHE, N of the INNOVERT
+IBD, D of the Delixi, Y of the YD1000. A code such as 0.1 concerns several documents.
 """
 
 from __future__ import annotations
@@ -361,7 +364,8 @@ def body(frame: str) -> str:
     return frame[:-2] if frame.startswith(":") else frame[:-6]
 
 
-def test_low_byte_of_a_yd1000_checksum_is_sent_first_erratum_y2() -> None:
+def test_low_byte_of_a_yd1000_checksum_is_sent_first() -> None:
+    """Erratum Y2."""
     line, drive, sim = one(YD1000(1))
     run(line, drive, sim)
     assert line.written[-1] == "01 06 10 00 C4 00 DF CA"
@@ -371,13 +375,15 @@ def reply_to(request: Message, frame: str) -> tuple[int, Message | None]:
     return parse_reply(Framing.RTU, bytes.fromhex(frame), request)
 
 
-def test_erman_checksum_is_computed_not_copied_from_the_example_erratum_e1() -> None:
+def test_erman_checksum_differs_from_the_wrong_example() -> None:
+    """Erratum E1."""
     line, drive, _ = one(ErmanERG220(1))
     drive.read(drive.output_frequency, drive.output_current, drive.dc_bus_voltage)
     assert [frame for _, frame in line.frames] == ["01 04 00 01 00 05 61 C9"]
 
 
-def test_erman_reply_with_another_byte_count_is_rejected_erratum_e2() -> None:
+def test_erman_reply_with_another_byte_count_is_rejected() -> None:
+    """Erratum E2."""
     printed = "01 04 10 01 F4 00 00 00 D6 00 00 02 32 0A 03"
     line, drive, _ = one(ErmanERG220(1))
     line.answers = lambda request: bytes.fromhex(printed)
@@ -386,17 +392,20 @@ def test_erman_reply_with_another_byte_count_is_rejected_erratum_e2() -> None:
 
 
 @table("code", [2, 3, 4])
-def test_erman_exception_for_a_bad_address_is_no_device_failure_erratum_e12(code: int) -> None:
+def test_erman_exception_for_a_bad_address_is_no_device_failure(code: int) -> None:
+    """Erratum E12."""
     assert "address" in ErmanERG220(1).exception(code)
     assert "fail" not in ErmanERG220(1).exception(code)
 
 
-def test_erman_state_is_decoded_from_either_word_erratum_e9_e10() -> None:
+def test_erman_state_is_decoded_from_either_of_two_words() -> None:
+    """Errata E9, E10."""
     assert ErmanERG220.status.number_format is NumberFormat.U32_EITHER
     assert [ErmanERG220.status.decode(number) for number in range(4)] == list(ErmanStatus)[:4]
 
 
-def test_erman_declares_neither_diagnostics_nor_unknown_addresses_erratum_e13_e16() -> None:
+def test_erman_has_no_registers_for_diagnostics_or_at_unknown_addresses() -> None:
+    """Errata E13, E16."""
     assert {register.table.read for register in ErmanERG220.registers.values()} <= {1, 3, 4}
     assert max(register.address for register in ErmanERG220.registers.values()) == 0x0402
     assert all(
@@ -404,15 +413,16 @@ def test_erman_declares_neither_diagnostics_nor_unknown_addresses_erratum_e13_e1
     )
 
 
-def test_request_refused_as_damaged_by_an_invt_che_is_repeated_erratum_i4() -> None:
+def test_a_request_is_repeated_if_an_invt_che_received_it_damaged() -> None:
+    """Erratum I4."""
     line, drive, _ = one(InvtCHE(1))
     line.refuses = lambda request: 0x11 if len(line.frames) == 1 else 0
     assert drive.read(drive.output_frequency) == 0
     assert len(line.frames) == 2
 
 
-def test_erman_identify_refuses_the_models_03_and_04_erratum_i2_e() -> None:
-    """These models lack function 04; the exception makes `identify` refuse them."""
+def test_erman_identity_check_refuses_the_models_03_and_04() -> None:
+    """Erratum I2. These models lack function 04; the exception makes `identify` refuse them."""
     line, drive, _ = one(ErmanERG220(1))
     line.refuses = lambda request: 1 if request.function == 4 else 0
     with pytest.raises(WriteForbidden, match="not an ER-G-220"):
@@ -420,7 +430,8 @@ def test_erman_identify_refuses_the_models_03_and_04_erratum_i2_e() -> None:
     assert line.written == []
 
 
-def test_erman_byte_count_of_coils_is_rounded_up_erratum_e7() -> None:
+def test_erman_byte_count_of_coils_is_rounded_up() -> None:
+    """Erratum E7."""
     request = Message(1, 1, 0, 12)
     # the printed reply has 2 data bytes for 12 coils
     assert reply_to(request, "01 01 02 00 01 78 3C")[0] > 0
@@ -428,49 +439,62 @@ def test_erman_byte_count_of_coils_is_rounded_up_erratum_e7() -> None:
     assert reply_to(request, checksums.rtu("01 01 01 00").hex())[0] <= 0
 
 
-def test_erman_reserved_state_registers_are_not_declared_erratum_e8() -> None:
+def test_erman_reserved_state_registers_are_not_declared() -> None:
+    """Erratum E8."""
     state = {register.address for register in ErmanERG220.registers.values() if register.table.read == 4}
     assert not state & set(range(0x0007, 0x000C))
 
 
-def test_erman_function_08_has_a_subfunction_of_two_bytes_erratum_e14() -> None:
+def test_erman_function_08_has_a_subfunction_of_two_bytes() -> None:
+    """Erratum E14."""
     printed = "01 08 00 00 A5 37 DA 8D"
     assert build_request(Framing.RTU, Message(1, 8, 0x0000, data=b"\xa5\x37")).hex(" ").upper() == printed
 
 
-def test_user_can_choose_parity_and_stop_bits_of_an_invt_che_erratum_i3() -> None:
+def test_user_can_choose_parity_and_stop_bits_of_an_invt_che() -> None:
+    """Erratum I3."""
     assert {"8N1", "8N2", "8E1", "8E2"} <= set(InvtCHE.formats[Framing.RTU])
     assert InvtCHE(1, format="8E2").settings.format == "8E2"
 
 
-def test_unexplained_example_of_the_invt_che_manual_cannot_be_sent_erratum_i6() -> None:
+def test_unexplained_example_of_the_invt_che_manual_cannot_be_sent() -> None:
+    """Erratum I6."""
     assert not [register for register in InvtCHE.registers.values() if register.address == 0x0008]
 
 
-def test_at_most_four_innovert_ibd_registers_are_read_at_once_erratum_n3_n6() -> None:
+def test_at_most_four_innovert_ibd_registers_are_read_at_once() -> None:
+    """Errata N3, N6."""
     line, drive, _ = one(InnovertIBD(1))
     drive.read_many([register for register in drive.registers.values() if register.readable])
     assert max(request.count for request, _ in line.frames) <= 4
     assert reply_to(Message(1, 3, 0x16, 1), "01 03 02 18 00 B2 44")[1] is not None
 
 
-def test_innovert_ibd_with_unprogrammed_outputs_never_reports_stopped_erratum_n9() -> None:
+def test_innovert_ibd_with_unprogrammed_outputs_never_reports_stopped() -> None:
+    """Erratum N9."""
     _, drive, sim = one(InnovertIBD(1))
     sim["output_m01"] = 0
     assert drive.state().condition is Condition.UNKNOWN
 
 
-def test_delixi_states_2_and_3_are_running_and_a_changed_copy_is_rejected_erratum_d2_d15() -> None:
+def test_delixi_states_2_and_3_are_running() -> None:
+    """Erratum D2."""
     _, drive, sim = one(DelixiNative(1))
-    sim["status"] = DelixiNativeStatus.FORWARD
-    assert drive.state().condition is Condition.RUNNING
+    for status in (DelixiNativeStatus.FORWARD, DelixiNativeStatus.REVERSE):
+        sim["status"] = status
+        assert drive.state().condition is Condition.RUNNING
+
+
+def test_delixi_reply_with_swapped_bytes_is_rejected() -> None:
+    """Erratum D15."""
     request = Message(1, 4, 1, data=b"\0\0\x13\x88")
     swapped = build_reply(Framing.DELIXI, Message(1, 4, 1, data=b"\0\0\x88\x13"))
     assert text(swapped)[-2:] == "A1"  # the checksum does not detect that two bytes were swapped
     assert parse_reply(Framing.DELIXI, swapped, request)[0] < 0
 
 
-def test_delixi_line_settings_correct_the_misprints_erratum_d1_d3_d6_d9() -> None:
+def test_delixi_line_settings_correct_the_misprints() -> None:
+    """Errata D1, D3, D6, D9."""
     assert 4800 in DelixiModbus.baudrates
     assert 3800 not in DelixiModbus.baudrates
     assert DelixiModbus.formats[Framing.ASCII][0] == "7N2"
@@ -479,13 +503,15 @@ def test_delixi_line_settings_correct_the_misprints_erratum_d1_d3_d6_d9() -> Non
     assert DelixiModbus.response_timeout >= 0.08
 
 
-def test_delixi_fault_04_is_decoded_as_ou_erratum_d8() -> None:
+def test_delixi_fault_04_is_an_overvoltage() -> None:
+    """Erratum D8."""
     (ou,) = {drive.fault.decode(4) for drive in (DelixiModbus, DelixiNative)}
     assert ou.name == "OU_OVERVOLTAGE"
 
 
 @pytest.mark.parametrize("code", [1, 2, 0x42])
-def test_any_exception_code_is_a_refusal_erratum_d13_y15(code: int) -> None:
+def test_every_exception_code_is_a_refusal(code: int) -> None:
+    """Errata D13, Y15."""
     for make in (delixi, yd):
         line, drive, _ = one(make())
         line.refuses = lambda request: code
@@ -494,27 +520,31 @@ def test_any_exception_code_is_a_refusal_erratum_d13_y15(code: int) -> None:
         assert raised.value.code == code
 
 
-def test_delixi_faults_10_to_14_are_decoded_in_decimal_and_hex_erratum_d7() -> None:
+def test_delixi_faults_10_to_14_are_decoded_in_decimal_and_hex() -> None:
+    """Erratum D7."""
     assert [DelixiNative.fault.decode(0x0A + at) for at in range(5)] == [
         DelixiNative.fault.decode(0x10 + at) for at in range(5)
     ]
 
 
-def test_yd1000_uses_only_functions_03_and_06_and_never_address_0_erratum_y5_y6() -> None:
+def test_yd1000_uses_only_functions_03_and_06_and_never_address_0() -> None:
+    """Errata Y5, Y6."""
     assert {(register.table.read, register.table.write) for register in YD1000.registers.values()} == {(3, 6)}
     assert YD1000.most_registers == {HOLDING: 1}
     with pytest.raises(ValueError, match="1 to 63"):
         YD1000(0)
 
 
-def test_yd1000_frame_lengths_follow_from_their_fields_erratum_y3_y4() -> None:
+def test_yd1000_frame_lengths_differ_from_the_wrong_table() -> None:
+    """Errata Y3, Y4."""
     assert len(build_request(Framing.RTU, Message(1, 6, 0x1001, data=b"\x1f\x40"))) == 8
     request = Message(1, 3, 0x1100, 1)
     used, reply = reply_to(request, checksums.rtu("01 03 02 13 88").hex())
     assert (used, reply and reply.data) == (7, b"\x13\x88")
 
 
-def test_frozen_yd1000_status_is_not_reported_as_running_erratum_y8() -> None:
+def test_frozen_yd1000_status_is_not_reported_as_running() -> None:
+    """Erratum Y8."""
     line, drive, sim = one(YD1000(1))
     run(line, drive, sim)
     line.sleep(2)
@@ -526,19 +556,24 @@ def test_frozen_yd1000_status_is_not_reported_as_running_erratum_y8() -> None:
     drive.stop()
 
 
-def test_factory_value_of_the_yd1000_watchdog_is_unknown_erratum_y12() -> None:
+def test_factory_value_of_the_yd1000_watchdog_is_unknown() -> None:
+    """Erratum Y12."""
     assert "the factory value is not stated" in YD1000.watchdog
     assert YD1000.communication_timeout.default is None
 
 
-def test_registers_kept_in_eeprom_are_declared_as_eeprom_erratum_0_8() -> None:
+def test_registers_kept_in_eeprom_are_declared_as_eeprom() -> None:
+    """Erratum 0.8."""
     for register in YD1000.registers.values():
         in_ram = 0x1000 <= register.address <= 0x12FF
         assert (register.kept is Kept.EEPROM) == (not in_ram) or register.access.value == "reading"
 
 
-def test_echo_of_an_adapter_is_not_accepted_as_a_drive_erratum_0_3() -> None:
-    """If only copies of the requests arrive, no read gets a valid reply, and no write is sent."""
+def test_echo_of_an_adapter_is_not_accepted_as_a_drive() -> None:
+    """Erratum 0.3.
+
+    If only copies of the requests arrive, no read gets a valid reply, and no write is sent.
+    """
     line = SimulatedBus()
     drives = [line.attach(make) for make in (InvtCHE(1, maximum_frequency=50), ErmanERG220(2), YD1000(3))]
     for drive in drives:
@@ -561,7 +596,8 @@ OF_PRINT_ALONE = {
 
 
 def test_every_erratum_of_a_document_has_a_test_or_a_reason_for_having_none() -> None:
-    names = [*HAZARDS, *(name.upper() for name in globals() if name.startswith("test_"))]
+    tests = [test for name, test in globals().items() if name.startswith("test_")]
+    names = [*HAZARDS, *(test.__doc__ or "" for test in tests)]
     for family, last in FAMILIES.items():
         for number in range(1, last + 1):
             erratum = f"{family}{number}"

@@ -45,8 +45,8 @@ class Sheet:
     shows_setpoint: int = 0  # address of a register that shows the setpoint; 0: there is none
     # by write: the register values that it causes
     passes: Mapping[Word, Mapping[int, int]] = field(default_factory=dict)
-    standing: Condition = Condition.STOPPED  # condition of the drive's state at rest
-    failed: Condition = Condition.FAULT  # condition of the drive's state in a fault
+    standing: Condition = Condition.STOPPED  # condition that the drive reports at rest
+    failed: Condition = Condition.FAULT  # condition that the drive reports in a fault
 
 
 # ER-G-220-01(02) protocol 1.4, section 10. Reads of reserved registers are answered with 0 (section 6).
@@ -92,7 +92,8 @@ def with_registers(
 
 SHEETS = {
     "erman-er-g-220": ERMAN,
-    # wb-community: input register 26 is the water pressure, holding register 98 its setpoint.
+    # Template of the wb-community project: input register 26 is the water pressure, holding register 98 its
+    # setpoint.
     "erman-er-g-220-02": with_registers(ERMAN, {98: 300}, {}, water_pressure=2.5, pressure_setpoint=3),
     # ERMANGIZER protocol of 2026, p. 2: register 5 counts 0.01 bar; register 14 is a letter.
     "erman-er-g-220-03": Sheet(
@@ -232,7 +233,8 @@ SHEETS = {
         ((0x2000, 6),),
         (0x2000, 7),
     ),
-    # A1000 manual 27G p. 559 to 561, 27C p. 494: bit 1 zero speed, 0 runs, 5 ready, 7 fault, 15 by the line.
+    # A1000 manual 27G p. 559 to 561, 27C p. 494. Status bits: 0 motor runs, 1 speed is zero, 5 ready,
+    # 7 fault, 15 run commands come from the bus.
     "yaskawa-a1000": Sheet(
         {1: 0, 2: 0, 0x23: 2000, 0x24: 0, 0x26: 0, 0x34: 0x4130, 0x4B: 0x8022, 0x80: 0},
         {"reference_in_force": 20, "output_frequency": 20, "output_current": 8.4},
@@ -250,7 +252,8 @@ SHEETS = {
     "delta-cp2000": with_registers(DELTA, {0x2200: 0}, {0x2200: 840}, output_current=8.4),
     "delta-vfd-el": with_registers(DELTA, {0x2104: 0}, {0x2104: 84}, output_current=8.4),
     "delta-ms300": with_registers(DELTA, {0x2105: 5401}, {}, dc_bus_voltage=540.1),
-    # ATV312.yaml, CMD 8501 and ETA 3201: 6 shut down, 7 switch on, 15 enable; 7 disables operation.
+    # ATV312.yaml: control word CMD at 8501, status word ETA at 3201. The control words 6, 7 and 15 start the
+    # motor in three steps; 7 stops it again.
     "schneider-atv320": Sheet(
         {8501: 0, 8502: 0, 3201: 0x0250, 3202: 0, 3204: 0, 7121: 0},
         {"output_frequency": 20, "output_current": 8.4},
@@ -409,7 +412,7 @@ def test_each_of_the_25_families_has_a_responder() -> None:
 
 
 @table("name", COMMANDED)
-def test_start_stop_and_reset_send_the_documented_words_and_values_match(name: str) -> None:
+def test_commands_to_each_family_send_the_words_of_its_manual(name: str) -> None:
     sheet = SHEETS[name]
     driven, there = connected(name)
     assert driven.state().condition is sheet.standing
@@ -434,7 +437,7 @@ def test_start_stop_and_reset_send_the_documented_words_and_values_match(name: s
 
 
 @table("name", READ_ONLY)
-def test_values_read_from_a_responder_without_commands_match_its_manual(name: str) -> None:
+def test_read_only_families_return_the_values_of_their_manuals(name: str) -> None:
     drive, there = connected(name)
     drive.bus.check_identity(drive)
     assert values(drive, SHEETS[name].shown) == SHEETS[name].shown
@@ -443,7 +446,7 @@ def test_values_read_from_a_responder_without_commands_match_its_manual(name: st
 
 @pytest.mark.long
 @table("name", COMMANDED)
-def test_simulation_of_each_family_starts_stops_resets_and_is_read(name: str) -> None:
+def test_simulation_of_each_family_obeys_every_command(name: str) -> None:
     sheet = SHEETS[name]
     line, drive, sim = one(made(name))
     assert drive.state().condition is sheet.standing

@@ -44,8 +44,8 @@ SAME_WORDS = (
 SAME_STOP = {"invt-che", "invt-chf100a", "fuling-dzb"}
 
 AT_2000 = ("invt-goodrive", "powtran-pi130")
-# Pairs of families in which one's stop word would run the other's motor. The stop is withheld if the drive
-# proves its make. See docs/reference/profiles.md.
+# declared family -> families whose motor its stop word would run. The stop is not sent if the drive's
+# registers prove that it is of such a family. See docs/reference/profiles.md.
 RUNS_AT_A_STOP = {
     **dict.fromkeys(("innovert-ibd", "innovert-idd-mini-plus", "delixi-modbus"), AT_2000),
     **dict.fromkeys(("delta-vfd-el", "delta-ms300", "delta-cp2000"), AT_2000),
@@ -54,7 +54,7 @@ RUNS_AT_A_STOP = {
         *("delta-vfd-el", "delta-ms300", "delta-cp2000"),
     ),
 }
-# built-in makes that are always recognised: they get no frame of another family
+# A drive of these built-in families is always recognised. It gets no stop if another family is declared.
 RECOGNISED = {"invt-che", "yd1000"}
 
 
@@ -97,7 +97,7 @@ def test_no_command_is_sent_to_a_drive_of_another_make(declared: str, there: str
 @pytest.mark.parametrize("turns", usually(True, False), ids=["turning", "at rest"])
 @every_declaration
 @table("there", THERE)
-def test_stop_runs_no_other_make_nor_succeeds_while_it_turns(declared: str, turns: bool, there: str) -> None:
+def test_a_stop_never_starts_a_drive_of_another_make(declared: str, turns: bool, there: str) -> None:
     if declared == there or same_words(declared, there):
         return
     pair = Pair(declared, there, turns)
@@ -133,7 +133,7 @@ def test_documentation_lists_the_stops_that_are_withheld(declared: str, there: s
 
 
 @pytest.mark.parametrize("declared", ["delta-vfd-el", "delta-cp2000"])
-def test_parameter_with_the_value_of_the_address_does_not_hide_a_goodrive(declared: str) -> None:
+def test_a_goodrive_is_recognised_if_a_parameter_equals_its_address(declared: str) -> None:
     """Register 0900H of a Goodrive is P09.00, whose value may equal the address."""
     pair = Pair(declared, "invt-goodrive", turns=False)
     show = pair.sim.answer

@@ -126,7 +126,7 @@ def test_yd1000_registers_equal_the_typed_tables_of_sections_6_and_7() -> None:
 
 
 @table("row", parameters())
-def test_yd1000_factory_values_and_locks_while_running_are_as_documented(row: tuple[str, ...]) -> None:
+def test_yd1000_defaults_and_write_locks_equal_the_document(row: tuple[str, ...]) -> None:
     register = YD1000.registers[row[1]]
     assert register.default == (None if row[-2] == "X" else float(row[-2]))
     assert register.while_running == (row[-1] == "Y")
@@ -302,7 +302,7 @@ def test_yd1000_start_without_a_setpoint_is_refused() -> None:
     assert wire.sent == []
 
 
-def test_yd1000_start_with_setpoint_by_fnod_ignores_the_setpoint_1001h() -> None:
+def test_yd1000_start_sends_no_setpoint_if_the_panel_selects_its_source() -> None:
     wire = Wire(YD1000(1, setpoint_by_fnod=1), STANDING, turns={yd_word(0x8400): TURNS[FORWARD]})
     wire.drive.start()
     assert wire.sent == [yd_word(0x8400)]
@@ -475,7 +475,7 @@ FUNCTIONS = {f"input_{at}_function": factory for at, factory in enumerate((2.0, 
         ("release_control", ", .* once the line no longer commands it"),
     ],
 )
-def test_yd1000_keeps_control_while_a_terminal_commands_a_run(
+def test_yd1000_release_of_control_is_refused_if_a_terminal_would_run_it(
     says: dict[str, object], terminal: str, verb: str, consequence: str
 ) -> None:
     wire = Wire(YD1000(1), {**STANDING, **FUNCTIONS, **says})
@@ -491,7 +491,7 @@ def test_yd1000_terminals_without_a_run_function_do_not_block_a_reset(closed: In
     assert wire.sent == [frame(YD1000(1), YD1000.control, YD1000Control(0xE000)), STOP]
 
 
-def test_yd1000_limit_that_the_document_does_not_state_names_its_source() -> None:
+def test_error_of_an_inferred_yd1000_limit_names_its_source() -> None:
     """By the notes, the upper frequency limit is at most the maximum frequency. The reverse is inferred."""
     wire = Wire(YD1000(1), {**STANDING, "upper_limit_frequency": 60.0})
     with pytest.raises(
@@ -501,7 +501,7 @@ def test_yd1000_limit_that_the_document_does_not_state_names_its_source() -> Non
     assert str(refusal.value).endswith("(in the manual, maximum_frequency is 6.1, FH)")
 
 
-# the word 0: bits 15 and 14 are off (section 8.1)
+# The control word 0 clears bits 15 and 14, which returns control to the panel and terminals (section 8.1).
 RELEASE = checksums.rtu("01 06 10 00 00 00").hex(" ").upper()
 
 

@@ -76,13 +76,13 @@ def test_csv_address_above_65535_is_reported_as_not_imported(tmp_path: Path) -> 
     assert omissions(device) == ["a: its address is not from 0 to 65535"]
 
 
-def test_decimal_address_among_hex_addresses_is_marked_as_a_gap(tmp_path: Path) -> None:
+def test_decimal_address_among_hex_addresses_is_reported_as_ambiguous(tmp_path: Path) -> None:
     device = only(tmp_path, "t.csv", "name,address,type\na,10,uint16\nb,1F,uint16\n")
     assert "its address 10 may be hex, as others of its column are" in gaps(device, "a")
     assert "b: it cannot be read:" in omissions(device)[0]
 
 
-def test_unit_of_a_coil_in_a_csv_table_is_left_out_and_marked_as_a_gap(tmp_path: Path) -> None:
+def test_unit_of_a_coil_in_a_csv_table_is_left_out_and_reported(tmp_path: Path) -> None:
     device = row(tmp_path, "address,type,table,unit", "5,uint16,coil,V")
     assert entries(device)["a"] == {"at": 5, "table": "coil"}
     assert found(device) == ["its type, unit and scale were left out: a coil is a bit"]
@@ -116,7 +116,7 @@ def test_scale_column_with_several_meanings_is_marked_as_a_gap(
     assert found(device) == ([gap] if gap else [])
 
 
-def test_decimal_of_a_neuron_tag_is_a_factor_and_its_bias_is_added(tmp_path: Path) -> None:
+def test_column_decimal_of_an_emqx_neuron_table_is_a_factor(tmp_path: Path) -> None:
     header = "address,attribute,type,decimal,precision,bias"
     device = row(tmp_path, header, "1!400001,Read Subscribe,UINT16,2,3,-40")
     assert entries(device)["a"] == {"at": 0, "step": 2, "offset": -40}
@@ -136,7 +136,7 @@ def test_second_scale_column_of_a_csv_table_is_marked_as_a_gap(tmp_path: Path) -
     assert found(device) == ["the column data type was not carried over"]
 
 
-def test_offset_together_with_a_scale_column_is_marked_as_a_gap(tmp_path: Path) -> None:
+def test_order_of_offset_and_scale_in_a_csv_table_is_reported(tmp_path: Path) -> None:
     device = row(tmp_path, "address,type,scale,offset", "0x10,uint16,0.1,-40")
     assert found(device) == ["its offset -40 was taken as added after the step"]
 
@@ -210,7 +210,9 @@ WRITTEN = ["it is written there; what a write does is not known here"]
         ("sometimes", ["its access 'sometimes' is not known; it is read here"]),
     ],
 )
-def test_write_or_unknown_csv_access_is_marked_as_a_gap(tmp_path: Path, word: str, said: list[str]) -> None:
+def test_write_or_unknown_access_in_a_csv_table_is_reported(
+    tmp_path: Path, word: str, said: list[str]
+) -> None:
     assert found(row(tmp_path, "address,type,access", f"0x10,uint16,{word}")) == said
 
 
@@ -232,7 +234,7 @@ def test_csv_columns_that_are_not_imported_are_reported(tmp_path: Path) -> None:
     assert omissions(device) == ["the column wobble: is not known here, and was not carried over"]
 
 
-def test_csv_column_named_register_with_numbers_is_read_as_addresses(tmp_path: Path) -> None:
+def test_numbers_in_a_csv_column_register_are_addresses(tmp_path: Path) -> None:
     device = only(tmp_path, "t.csv", "Register,Name,Type\n16,volts,uint16\n")
     assert entries(device)["volts"]["at"] == 16
 
@@ -243,7 +245,7 @@ def test_lines_above_the_column_names_of_a_csv_table_are_skipped(tmp_path: Path)
 
 
 @pytest.mark.parametrize("comma", [",", ";", "\t"])
-def test_the_first_column_of_a_csv_table_may_be_named_number_sign(tmp_path: Path, comma: str) -> None:
+def test_the_first_column_of_a_csv_table_may_have_the_name_hash(tmp_path: Path, comma: str) -> None:
     lines = ["# a comment", "#,Name,Address,Type", "1,volts,0x10,uint16", "#2,amperes,0x11,uint16"]
     device = only(tmp_path, "t.csv", "\n".join([lines[0], *(one.replace(",", comma) for one in lines[1:])]))
     assert {name: entry["at"] for name, entry in entries(device).items()} == {"volts": 16}

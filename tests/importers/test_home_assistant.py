@@ -60,7 +60,7 @@ def test_home_assistant_entity_of_unsupported_type_is_refused(tmp_path: Path, ke
         sensor(tmp_path, keys)
 
 
-def test_home_assistant_count_is_the_words_of_all_virtual_entities_together(tmp_path: Path) -> None:
+def test_home_assistant_count_is_shared_by_all_virtual_entities(tmp_path: Path) -> None:
     """See home-assistant/core#97744."""
     found = entries(sensor(tmp_path, "slave_count: 2, count: 6, data_type: int32, swap: word"))
     assert [entry["at"] for entry in found.values()] == [5, 7, 9]
@@ -96,7 +96,7 @@ WRITTEN = "it is written there; what a write does is not known here"
 
 
 @pytest.mark.parametrize("plural", ["holdings", "coils"])
-def test_write_type_of_a_home_assistant_switch_does_not_change_its_table(tmp_path: Path, plural: str) -> None:
+def test_home_assistant_switch_is_read_from_the_table_that_it_writes(tmp_path: Path, plural: str) -> None:
     device = sensor(tmp_path, f"write_type: {plural}", "switches")
     assert entries(device)["a"].get("table", "holding") == plural.rstrip("s")
     assert gaps(device, "a") == [WRITTEN]

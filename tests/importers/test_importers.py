@@ -318,7 +318,7 @@ def test_registers_above_the_limit_are_reported(tmp_path: Path, monkeypatch: pyt
         ("a.json", "[]", "is neither a wb-mqtt-serial template nor a SunSpec model: it is a list"),
         ("a.json", '{"a": {}}', "has no `device` with channels or parameters (wb-mqtt-serial)"),
         ("a.json", "{", "a.json: "),
-        ("a.json", '{"device": {"channels": 5}}', "does not have the structure"),
+        ("a.json", '{"device": {"channels": 5}}', "is not a table of a supported program"),
         ("a.toml", "a = 1", "has no [[inputs.modbus]] (Telegraf): it has a"),
         ("a.toml", "[[inputs.modbus]]", "[[inputs.modbus]] has no field"),
         ("a.toml", "\na = ", "a.toml:2: the file is not TOML"),

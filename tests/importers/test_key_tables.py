@@ -206,7 +206,9 @@ UNKNOWN: dict[str, tuple[str, str | dict[str, Any]]] = {
 
 
 @pytest.mark.parametrize("source", UNKNOWN)
-def test_key_that_an_importer_does_not_know_is_a_gap_of_its_register(tmp_path: Path, source: str) -> None:
+def test_key_that_an_importer_does_not_know_is_reported_with_its_register(
+    tmp_path: Path, source: str
+) -> None:
     pytest.importorskip("yaml")
     device = only(tmp_path, *UNKNOWN[source])
     assert list(entries(device)) == ["a"]

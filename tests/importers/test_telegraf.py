@@ -40,7 +40,7 @@ def of_a_request(folder: Path, keys: str, more: str = "") -> ImportedDevice:
         ('byte_order = "AB", data_type = "BIT", bit = 3, address = [5]', {"part": "3"}),
     ],
 )
-def test_telegraf_float32_in_the_register_style_is_a_whole_number(
+def test_telegraf_float32_is_a_whole_number_if_the_style_is_register(
     tmp_path: Path, keys: str, expected: dict[str, object]
 ) -> None:
     found = entries(of_registers(tmp_path, keys))["a"]
@@ -48,7 +48,7 @@ def test_telegraf_float32_in_the_register_style_is_a_whole_number(
     assert found == expected
 
 
-def test_telegraf_float32_in_the_other_styles_is_a_float(tmp_path: Path) -> None:
+def test_telegraf_float32_is_a_float_if_the_style_is_request_or_metric(tmp_path: Path) -> None:
     assert entries(of_a_request(tmp_path, 'address = 5, type = "FLOAT32"'))["a"]["number_format"] == "F32"
     metric = (
         '[[inputs.modbus.metric]]\nslave_id = 1\nfields = [{ name = "b", address = 5, type = "FLOAT32" }]\n'
@@ -56,7 +56,7 @@ def test_telegraf_float32_in_the_other_styles_is_a_float(tmp_path: Path) -> None
     assert entries(only(tmp_path, "t.conf", HEAD + metric))["b"]["number_format"] == "F32"
 
 
-def test_telegraf_float64_in_the_register_style_is_not_imported(tmp_path: Path) -> None:
+def test_telegraf_float64_is_not_imported_if_the_style_is_register(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="a: its type FLOAT64 has no number format"):
         of_registers(tmp_path, 'byte_order = "ABCD", data_type = "FLOAT64", address = [5, 6, 7, 8]')
 
@@ -80,7 +80,7 @@ def test_telegraf_text_in_the_high_bytes_is_reported_as_not_imported(tmp_path: P
         of_a_request(tmp_path, 'address = 5, type = "STRING", length = 4', workaround)
 
 
-def test_telegraf_fields_of_a_style_other_than_the_stated_one_are_ignored(tmp_path: Path) -> None:
+def test_telegraf_fields_are_ignored_if_another_style_is_stated(tmp_path: Path) -> None:
     both = f'{HEAD}configuration_type = "request"\ncoils = [{{ name = "old", address = [1] }}]\n'
     request = (
         '[[inputs.modbus.request]]\nslave_id = 1\nfields = [{ name = "new", address = 1, type = "INT16" }]\n'

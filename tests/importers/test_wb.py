@@ -33,7 +33,7 @@ def places(device: ImportedDevice) -> list[tuple[str, int]]:
     return [(register.name, register.address) for register in device.registers]
 
 
-def test_registers_of_a_wb_mqtt_subdevice_are_shifted_for_each_channel_that_uses_it(tmp_path: Path) -> None:
+def test_registers_of_a_wb_mqtt_subdevice_are_shifted_for_each_channel(tmp_path: Path) -> None:
     first = {"name": "First", "device_type": "ch", "shift": 256}
     second = {"name": "Second", "device_type": "ch", "shift": "0x200", "stride": 2}
     device = only(tmp_path, "w.json", with_subdevice(first, second))
@@ -112,7 +112,7 @@ def test_bits_across_three_wb_mqtt_serial_registers_are_marked_as_a_gap(tmp_path
     assert gaps(device, "a") == ["only its count is read: its bits 30 to 33 of the format u16"]
 
 
-def test_8_bit_format_of_a_written_wb_mqtt_serial_register_selects_its_low_byte(tmp_path: Path) -> None:
+def test_wb_mqtt_format_of_8_bits_selects_the_low_byte(tmp_path: Path) -> None:
     assert entries(channel(tmp_path, reg_type="holding", format="u8"))["a"] == {"at": 5, "part": "0-7"}
 
 
@@ -164,7 +164,7 @@ def test_parts_of_a_composite_wb_mqtt_serial_channel_are_marked_as_gaps(tmp_path
     assert gaps(device, "a") == ["its place in a larger channel was not carried over"]
 
 
-def test_names_of_values_with_numbers_as_text_are_imported(tmp_path: Path) -> None:
+def test_value_names_are_imported_if_their_numbers_are_text(tmp_path: Path) -> None:
     named = channel(tmp_path, enum=["0", "2"], enum_titles=["off", "on"])
     assert entries(named)["a"]["values"] == {"off": 0, "on": 2}
 

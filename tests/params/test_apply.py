@@ -155,7 +155,7 @@ def test_parameters_of_another_model_are_refused() -> None:
         params.apply(drive, other)
 
 
-def test_communication_parameters_are_written_only_with_the_option_also() -> None:
+def test_communication_parameters_are_written_only_if_the_caller_lists_them() -> None:
     _, drive, sim = attached(YD1000(1), [])
     left = params.apply(drive, {"F803": 30, "F801": 0, "F111": 3}, also=["F801"])
     assert left.plan.left == {"F111": f"{COMMAND} (2 -> 3)"}
@@ -196,7 +196,9 @@ def test_parameter_that_the_drive_lacks_is_left_out() -> None:
         ({"0011": 12000, "0012": 10000, "0013": 9000}, ["0011", "0012", "0013"]),
     ],
 )
-def test_parameters_are_written_in_an_order_within_limits(values: dict[str, int], order: list[str]) -> None:
+def test_parameters_are_written_in_an_order_that_keeps_their_limits(
+    values: dict[str, int], order: list[str]
+) -> None:
     _, drive, sim = attached(YD1000(1), [])
     done = params.apply(drive, values)
     assert done.ok
@@ -254,7 +256,7 @@ def test_an_interrupted_apply_is_reported_by_the_next_apply() -> None:
     assert params.apply(drive, {"0009": 200}).earlier == []
 
 
-def test_a_motor_that_starts_during_apply_ends_the_apply() -> None:
+def test_apply_writes_no_more_parameters_after_the_motor_starts() -> None:
     _, drive, sim = attached(YD1000(1), [])
 
     def start(number: int, total: int, change: params.ParameterChange, not_written: object) -> None:
@@ -266,8 +268,9 @@ def test_a_motor_that_starts_during_apply_ends_the_apply() -> None:
     assert isinstance(done.failure, WriteForbidden)
 
 
-@pytest.mark.parametrize("family", [YD1000, DelixiModbus])  # a Delixi is sent a stop before its first write
-def test_a_stop_during_apply_ends_the_apply(family: type[Drive]) -> None:
+# A Delixi cannot report its state, so `apply` itself sends a stop before the first write.
+@pytest.mark.parametrize("family", [YD1000, DelixiModbus])
+def test_apply_writes_no_more_parameters_after_a_stop(family: type[Drive]) -> None:
     values = {"0009": 200, "0010": 200} if family is YD1000 else {"P01.00": 5, "P01.01": 6}
     line, drive, _ = attached(family(1), EXTRA[family])
     done = params.apply(drive, values, report=lambda *_: drive.stop())
@@ -306,7 +309,9 @@ def test_stop_while_the_plan_is_read_cancels_all_writes(monkeypatch: pytest.Monk
 
 # room: bytes until the disk is full. In each row, writing another line of the journal fails.
 @table("room", [0, 100, 130, 160, 200, 230])
-def test_the_apply_after_a_full_disk_completes_the_writes(monkeypatch: pytest.MonkeyPatch, room: int) -> None:
+def test_remaining_parameters_are_written_after_a_full_disk(
+    monkeypatch: pytest.MonkeyPatch, room: int
+) -> None:
     line, drive, _ = attached(ErmanERG220(1), [])
     # the EEPROM ledger is not affected by the full disk
     monkeypatch.setattr(Ledger, "enter", lambda *given: "")

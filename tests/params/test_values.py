@@ -101,7 +101,7 @@ def test_a_silent_drive_raises_the_error_no_reply() -> None:
 ADDRESSES = [
     ("delta-cp2000", "04-10", 0x040A),  # CP2000 manual p. 12.1-09-8
     ("powtran-pi130", "F0.01", 0xF001),  # PI130 manual p. 112
-    ("powtran-pi130", "F3.12", 0xF30C),  # PI500 manual p. 88, as the next entries
+    ("powtran-pi130", "F3.12", 0xF30C),  # PI500 manual p. 88, also for the next two
     ("powtran-pi130", "E3.21", 0xA315),
     ("powtran-pi130", "y1.30", 0xC11E),
     ("invt-goodrive", "P14.02", 0x0E02),  # Goodrive200A manual p. 138
@@ -115,7 +115,7 @@ def test_addresses_of_parameters_are_those_of_the_sources(model: str, code: str,
     assert parameters_of(find_model(model))[code].address == address
 
 
-# Codes that start a motor, let a panel, a terminal or the drive itself start one, or are of unknown function.
+# Codes of parameters that may let the motor start, and of parameters whose function is unknown.
 NEVER_WRITTEN = {
     "invt-goodrive": "P00.01 P00.02 P00.15 P00.18 P01.18 P01.21 P02.01 P05.00 P05.01 P05.09 P05.10 P05.12 "
     "P05.13 P07.00 P07.01 P07.02 P07.03 P07.04 P08.28",

@@ -285,8 +285,8 @@ def test_five_mistakes_in_one_plant_file_are_reported_together(mistakes: Mistake
         ),
         (
             HEAD + 'silence = "500 us"\n' + TOY,
-            'line "L", drive "D": silence 500 us is shorter than 1.5 characters at 9600 8N1, and a frame may '
-            "contain pauses as long: it must be 1563 us or more",
+            'line "L", drive "D": silence 500 us is too short at 9600 8N1: a frame may contain pauses of 1.5 '
+            "characters, so it must be 1563 us or more",
         ),
         (HEAD + 'silence = "2 s"\n' + TOY, 'line "L", drive "D": silence 2.0 is not a time from 0 to 1 s'),
         (HEAD + 'echo = "loud"\n' + TOY, 'line "L": echo \'loud\' is none of "auto", "on" and "off"'),

@@ -27,7 +27,8 @@ EXCEPTION_CODES = range(1, 256)
 _SAME_SPACE = {0x05: 0x0F, 0x06: 0x10}
 _TAKEN = "reserved name; every drive has it for something else"
 
-# For each attribute: its name, a function that checks the value, and the error's text after "NAME = VALUE"
+# For each attribute of a register: its name, a function that checks the value, and the end of the error
+# sentence, which starts with "NAME = VALUE".
 Rules = tuple[tuple[str, Callable[[Any], Any], str], ...]
 
 
@@ -183,7 +184,8 @@ def fact_errors(family: Any) -> list[str]:
                 wrong["options"] = (
                     f"options[{name!r}]: span = {option.span!r} is not the smallest and the largest value"
                 )
-    registers = {*family.registers, *family.texts}  # errors in their names are reported elsewhere
+    # a register with the name of an attribute is reported as a reserved name
+    registers = {*family.registers, *family.texts}
     return [sentence for name, sentence in wrong.items() if name not in registers]
 
 

@@ -83,7 +83,7 @@ class Drive(RegisterAccess):
     # s within which the drive replies, according to its document; 0: not stated
     answering_time: ClassVar[float] = 0.0
     turnaround_delay: ClassVar[float] = 0.1  # s without requests after a broadcast
-    least_interval: ClassVar[float] = 0.0  # s from a reply to the next request to this drive, at least
+    least_interval: ClassVar[float] = 0.0  # shortest time between a reply and the next request, in s
     # True if the drive answers every read of its tables, with a value or an exception
     answers_every_read: ClassVar[bool] = False
 
@@ -202,7 +202,7 @@ class Drive(RegisterAccess):
 
     @classmethod
     def speaks(cls, framing: Framing) -> bool:
-        """Return True if the family can use this framing; TCP needs any Modbus framing in the document."""
+        """Return True if the family can use this framing: one of its own, or TCP if it uses Modbus."""
         return framing in cls.framings or (
             framing is Framing.TCP and any(one in MODBUS for one in cls.framings)
         )
@@ -332,7 +332,7 @@ class Drive(RegisterAccess):
 
     @property
     def identity_is_weak(self) -> bool:
-        """True if `identify` may accept a drive of another make, so that `families.makes` is needed too."""
+        """True if `identify` may accept another make; then commands also check `families.makes`."""
         return False
 
     @property
@@ -574,7 +574,7 @@ def check_own(drive: Drive, register: Register[Any]) -> None:
     """
     check_drive(drive)
     if not isinstance(register, Register):
-        hint = "use an attribute of the drive, or drive.register(NAME); several as separate arguments"
+        hint = "pass attributes of the drive, or drive.register(NAME), as separate arguments"
         raise TypeError(f"{register!r} is not a Register of {drive.name}: {hint}")
     is_parameter = isinstance(register, Parameter) and isinstance(drive, register.family)
     if not is_parameter and drive.registers.get(register.name) is not register:

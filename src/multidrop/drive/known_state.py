@@ -51,7 +51,7 @@ class StateReader:
         return found
 
     def _look(self, values: Mapping[str, float], read: dict[str, float | None]) -> State | None:
-        """Return the state, or None if a value is missing. Store the values that were used in `read`."""
+        """Return the state, or None if a value is missing. Add the values that it depends on to `read`."""
         try:
             script = self._drive.state.script()
             step = next(script)
@@ -74,7 +74,10 @@ class StateReader:
 
 
 def _known(state: object, read: Mapping[str, float | None]) -> State | None:
-    """Return the state; without a fault code, only the condition FAULT is known."""
+    """Return the result of a family's `state` method if the values in `read` are enough for it, else None.
+
+    If the fault code is missing, a state with a fault is returned without the fault's name.
+    """
     if not isinstance(state, State) or read.get(FAULT, 0) is not None:
         return state if isinstance(state, State) else None
     return State(Condition.FAULT) if state.condition is Condition.FAULT else None

@@ -155,14 +155,14 @@ def framing_on(
 def check_agreed_silence(agreed: float, settings: Settings, own: float | None) -> None:
     """Raise ValueError unless `agreed`, a line's silence in s, is valid.
 
-    `own` is the silence in s that an RTU drive's document requires; None for other framings. Unless `own`
-    is at least 1.5 characters, `agreed` must be at least 1.5 characters: a frame may contain shorter pauses.
+    `own` is the silence in s that an RTU drive's document requires; None for other framings. The longer of
+    the two must last at least 1.5 characters, because an RTU frame may contain shorter pauses.
     """
     if not (is_number(agreed) and 0 <= agreed <= LONGEST_SILENCE):
         raise ValueError(f"silence {agreed!r} is not a time from 0 to {LONGEST_SILENCE:g} s")
     least = 1.5 * settings.character
     if own is not None and max(agreed, own) < least:
         raise ValueError(
-            f"silence {agreed * 1e6:g} us is shorter than 1.5 characters at {settings}, and a frame may "
-            f"contain pauses as long: it must be {math.ceil(least * 1e6)} us or more"
+            f"silence {agreed * 1e6:g} us is too short at {settings}: a frame may contain pauses of 1.5 "
+            f"characters, so it must be {math.ceil(least * 1e6)} us or more"
         )

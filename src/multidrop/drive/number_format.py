@@ -215,10 +215,10 @@ class Coding:
 
     @cached_property
     def invalid_patterns(self) -> tuple[tuple[int, int], ...]:
-        """Mask and bit pattern of each raw count that means "no value". NaN is invalid without a pattern.
+        """Mask and bit pattern of each raw count that means "no value", except NaN.
 
         A raw count that fits into the bit range `part` is compared with these bits, a larger raw count with
-        the whole number. A raw count outside the format's span is a bit pattern, such as 8000H for an I16.
+        the whole number. A raw count that the format cannot hold is a bit pattern, such as 8000H for an I16.
         """
         return tuple(self._pattern(count) for count in self.invalid if count == count)
 
@@ -275,10 +275,10 @@ class Coding:
         return nearest(count, self.number_format) if self.number_format in FLOATS else round(count)
 
     def exact_count(self, value: float) -> Fraction:
-        """Return the exact raw count of a value. A float counts as its shortest decimal: 0.3 is three tenths.
+        """Return the exact raw count of a value. A float stands for its shortest decimal: 0.3 is 3/10.
 
-        But if the float's exact value gives a whole raw count, that count is returned: the shortest decimal
-        may be inexact for 64-bit numbers.
+        Only if the float's binary value gives a whole raw count, that count is returned, because the shortest
+        decimal of a 64-bit number may be inexact.
         """
         count = (Fraction(value) - self.offset) / self.step
         return count if count.denominator == 1 else (Fraction(str(value)) - self.offset) / self.step

@@ -46,23 +46,19 @@ class ParameterGroup:
 
 @dataclass(frozen=True)
 class ParameterSpace:
-    """The parameters of a family. Codes in the fields below may be patterns, such as "P05.*".
+    """The parameters of a family. A code in these fields may be a pattern, such as "P05.*"."""
 
-    `groups` is the address rule. A family without a rule has the regular expression `named`, which finds the
-    code in the `place` of a declared register. `monitors` are values that the drive changes itself: they are
-    neither saved nor compared. `line` has the drive's address, baud rate, format and protocol, in the order
-    of writing. `never` maps codes that are not written to the reason. `firmware` is the name of the register
-    with the firmware version.
-    """
-
-    groups: tuple[ParameterGroup, ...] = ()
+    groups: tuple[ParameterGroup, ...] = ()  # the rule that computes an address from a code
+    # without `groups`: a regular expression that finds the code in the `place` of a declared register
     named: str = ""
     table: Table = HOLDING
-    monitors: tuple[str, ...] = ()
+    monitors: tuple[str, ...] = ()  # codes that the drive itself changes; neither saved nor compared
+    # codes of the drive's address, baud rate, format and protocol, in the order in which they are written
     line: tuple[str, ...] = ()
     passwords: tuple[str, ...] = ()
+    # codes that are never written -> reason
     never: Mapping[str, str] = field(default_factory=dict)
-    firmware: str = ""
+    firmware: str = ""  # name of the register with the firmware version
 
     def codes(self, registers: Mapping[str, Register[Any]]) -> dict[str, tuple[int, Table]]:
         """Return the address and table of each code; `registers` are those of the family."""
@@ -79,7 +75,7 @@ class ParameterSpace:
         return _matches(code, self.monitors)
 
     def reason(self, code: str) -> str:
-        """Return why this parameter is never written; "" if the parameter space does not forbid it."""
+        """Return why the parameter with this code is never written; "" if it may be written."""
         if _matches(code, self.line):
             return LINE_PARAMETER
         if _matches(code, self.passwords):
@@ -93,9 +89,10 @@ def _matches(code: str, patterns: tuple[str, ...]) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Parameter(Register[Any]):
-    """A parameter of a drive, as a register: declared by the family, or computed from its address rule.
+    """A parameter of a drive, as a register.
 
-    A parameter is always written to permanent memory, even if the register also has a RAM address.
+    The family declares the register, or its address is computed from the parameter's code. A parameter is
+    always written to permanent memory, even if the register also has a RAM address.
     """
 
     code: str = ""

@@ -430,7 +430,7 @@ class Details(TypedDict, total=False):
 
     step: float | None  #: quantity that one raw count stands for; None if the document does not state it
     offset: float  #: value of the raw count 0, so that value = raw count * step + offset
-    #: Raw counts that mean "no value", or bit patterns, such as 0x8000 for an I16
+    #: Raw counts that mean "no value". A bit pattern is also accepted, such as 0x8000 for an I16.
     invalid: float | tuple[float, ...]
     #: Lowest and highest bit of a reading that is only a part of a number. An `invalid` count that does not
     #: fit into these bits is compared with the whole number.
@@ -546,9 +546,9 @@ def catalogue(language: str) -> Mapping[str, str]:
 
 
 def chosen_language(tags: Iterable[str]) -> str:
-    """Return the first of these languages that has titles; English if none has.
+    """Return the first of these languages in which registers have titles; English if there is none.
 
-    A tag is such as `ru`, `zh-CN` or `ru_RU.UTF-8`.
+    A tag may be `ru`, `zh-CN` or `ru_RU.UTF-8`, for example.
     """
     codes = (match[0].lower() for tag in tags if (match := _CODE.match(tag.strip())))
     return next((code for code in codes if code in (*LANGUAGES, ENGLISH)), ENGLISH)

@@ -223,7 +223,7 @@ class UnattachedStop:
         """Do nothing: no stop was in progress."""
 
     def result(self) -> CommandResult:
-        """Raise NotAttached, because the drive has no bus."""
+        """Perform the stop, which raises NotAttached: the drive has no bus."""
         return cast(CommandResult, self._drive.perform(self._make()))
 
 

@@ -218,7 +218,7 @@ class ErmanERG220(Drive):
     emergency_stop_held = _held(0x0002, Coil)
     fault_reset_held = _held(0x0009, Coil)
 
-    _reset_fault = ErmanFault(0)  # the fault that was the last one when this object reset it
+    _reset_fault = ErmanFault(0)  # value of `last_fault` at the last reset; this fault does not block a start
 
     @classmethod
     def readings(cls) -> tuple[Register[Any], ...]:

@@ -31,7 +31,10 @@ def parameter(name: str) -> int:
 
 
 class IBDControl(IntEnum):
-    """The control words that this library sends. None has both direction bits, or the reversing bit."""
+    """The control words that this library sends.
+
+    No word sets both direction bits (2 and 3), and no word sets the bit that reverses a turning motor.
+    """
 
     NOTHING = 0x00
     STOP = 0x01
@@ -391,7 +394,10 @@ class InnovertIBD(Drive):
         return SHOWN_STATES.get(shown, State(Condition.UNKNOWN, note=f"run_state {shown} is not explained"))
 
     def _programmed(self) -> Script[bool]:
-        """Return True if the outputs are programmed as in the example. The addresses read are inferred."""
+        """Return True if the four outputs have the functions of the manual's example.
+
+        The addresses of these settings are inferred: an exception means False.
+        """
         try:
             for register, function in (
                 (self.output_m01, Output.RUNNING),

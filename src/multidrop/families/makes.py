@@ -49,7 +49,7 @@ class Make:
     runs: Callable[[float], bool]  # function that returns True for a control word that runs the motor
     evidence: tuple[tuple[Register[Any], Test], ...]
     may_be_silent: bool = False  # True if such a drive may not reply to reads of missing registers
-    copies: tuple[str, ...] = ()  # models whose drives these registers do not distinguish from this make
+    copies: tuple[str, ...] = ()  # models whose drives have the same values in these registers
 
     def shows(self, drive: Drive) -> Script[bool]:
         """Return True if the drive's registers have the values that prove this make. It only reads."""

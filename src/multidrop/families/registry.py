@@ -34,7 +34,7 @@ _SHIPPED = Path(__file__).parent / "shipped"
 # names of the family files in this package; each file is read when it is needed
 SHIPPED = tuple(sorted(path.stem for path in _SHIPPED.glob("*.toml")))
 
-# Families from files that a scan also looks for: more than a status register identifies their drives.
+# Shipped family files that a scan tries, because more than a status register identifies their drives.
 RECOGNISABLE = ("delixi-e", "invt-chf100a", "invt-goodrive", "powtran-pi130", "yaskawa-a1000")
 
 
@@ -100,8 +100,8 @@ def installed_family(name: str) -> type[Drive] | None:
         )
     if found.model != name:
         raise ValueError(
-            f"model {name!r} of package {packages[0]} has model = {found.model!r}: give its entry point "
-            f"that name"
+            f"model {name!r} of package {packages[0]} has model = {found.model!r}: rename its entry "
+            f"point to {found.model!r}"
         )
     return found
 

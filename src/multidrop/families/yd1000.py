@@ -24,7 +24,7 @@ PANEL = "it is effective from the panel only"
 LINE = "it changes the drive's end of the line; set it on the panel"
 COMMAND = "it decides what commands the motor; set it on the panel"
 NO_SCALE = "its scale is not stated"
-RUN_FUNCTIONS = (2, 3)  # input functions that run the motor; the factory settings of the terminals F and R
+RUN_FUNCTIONS = (2, 3)  # functions of a terminal that run the motor, as do F and R by default
 AT_ONCE = "Takes effect at once."
 AFTER_RESET = "Takes effect after a reset or at the next power-on."
 
@@ -218,7 +218,7 @@ class YD1000(Drive):
         "F800 baud rate (0 to 3: 1200, 2400, 4800, 9600; it must be 3, and an S7e is fixed at 1200), F801 "
         "parity (0 none, 1 even, 2 odd; it must be 1), both in effect after a reset or power-on; F802 address"
     )
-    parameter_space = ParameterSpace(  # sections 6.1, 6.2 and 7
+    parameter_space = ParameterSpace(  # manual, sections 6.1, 6.2 and 7
         groups=(
             ParameterGroup("", 0x0000, range(25), digits=4, as_hex=True),
             ParameterGroup("F", 0x0000, range(100, 900), digits=3, as_hex=True),
@@ -323,7 +323,7 @@ class YD1000(Drive):
         place="6.3: 1002",
     )
 
-    # Live values (section 6.4 of the notes)
+    # Live values (manual, section 6.4)
     output_frequency = reading(0x1100, "Hz", step=0.01, place="6.4: 1100")
 
     # Section 6.5
@@ -345,7 +345,7 @@ class YD1000(Drive):
     fault_record_4 = reading(0x1213, place="6.5: 1213", note="A code; the table of faults is missing.")
     run_hours = reading(0x1214, "h", step=1, place="6.5: 1214")
 
-    # Communication parameters (section 7 of the notes)
+    # Communication parameters (manual, section 7)
     baudrate_setting = setting(
         0x0800, YD1000Baudrate, kept=Kept.EEPROM, never=LINE, place="7 (1), F800", note=AFTER_RESET
     )
@@ -459,7 +459,7 @@ class YD1000(Drive):
         yield from self._started(direction)
 
     def _valid(self) -> YD1000Control:
-        """Return bit 15, and also bit 14 unless FNOD selects the source of the setpoint."""
+        """Return the bits that make a control word valid: 15, and 14 if 1001H is the setpoint."""
         return YD1000Control.COMMAND_VALID if self._by_fnod() else STOP
 
     def _without_fault(self) -> Script[State]:
@@ -529,7 +529,7 @@ class YD1000(Drive):
         self._record = yield from read(self.fault_record_1)
 
     def _no_terminal_runs(self, when: str) -> Script[None]:
-        """Raise WriteForbidden if a terminal would start the motor once bit 15 is 0, as after a restart."""
+        """Raise WriteForbidden if a closed terminal would start the motor when control returns to it."""
         closed = yield from read(self.inputs)
         functions = {"F110, which is always on,": self.always_on_function}
         for number, terminal in enumerate(Inputs, 1):  # F111 has the function of F, F112 that of R, and so on

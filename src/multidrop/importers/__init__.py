@@ -74,10 +74,10 @@ def all_devices(path: Path) -> list[ImportedDevice]:
             drop_undeclarable(device)
     except KeyError as missing:
         key = printable(str(missing.args[0]))[:200]
-        raise ValueError(f"{path} does not have the structure of such a file: {key} is missing") from missing
+        raise ValueError(f"{path} is not a table of a supported program: {key} is missing") from missing
     except (AttributeError, TypeError, IndexError, OverflowError, RecursionError) as failure:
         kind = f"{type(failure).__name__} {printable(str(failure))[:200]}"
-        raise ValueError(f"{path} does not have the structure of such a file: {kind}") from failure
+        raise ValueError(f"{path} is not a table of a supported program: {kind}") from failure
     except DocumentError as mistake:
         raise ValueError(printable(mistake.in_file(path))) from mistake
     except ValueError as mistake:

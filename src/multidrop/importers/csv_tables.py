@@ -26,7 +26,8 @@ from multidrop.importers.numbers import (
     words_of,
 )
 
-# by key of a register: the names of its column in lower case and without _, the most specific name first
+# key of a register -> names of the CSV column for it, in lower case and without _. If several columns have
+# such names, the first name in the list wins.
 COLUMNS = {
     "name": (
         *("name", "register name", "signal name", "parameter name", "register", "description", "parameter"),
@@ -79,8 +80,8 @@ GAPS = frozenset(
     }
 )
 _SPARE = frozenset(alias for key in ("name", "note", "at") for alias in COLUMNS[key])
-# Columns that may affect a register's value. They include second columns for one key, which may contradict
-# the first.
+# Columns that may affect a register's value. A second column for the same key is one of them, because it may
+# contradict the first.
 _VALUE_COLUMNS = GAPS | frozenset(alias for aliases in COLUMNS.values() for alias in aliases) - _SPARE
 _KNOWN = IRRELEVANT | _VALUE_COLUMNS | _SPARE
 _NUMBER = re.compile(r"[0-9]{1,9}")
@@ -201,7 +202,10 @@ class _Layout:
         return {name for place, name in self._others.items() if place < len(row) and row[place].strip()}
 
     def gaps(self, cells: Cells, further: set[str]) -> list[str]:
-        """Return a sentence for each unknown property of a row, such as a column that may affect it."""
+        """Return a sentence for each property of a register that its row leaves open.
+
+        One example is a column that is not imported, but may affect the register's value.
+        """
         columns = further & _VALUE_COLUMNS
         if _parse_tag(cells["at"]):
             columns -= {"precision"}  # the precision of a Neuron tag is only the number of digits shown
@@ -487,7 +491,8 @@ def _order(register: ImportedRegister, given: str) -> str:
 def _scale(register: ImportedRegister, cells: Cells, *, is_neuron: bool) -> None:
     """Set the step and the offset.
 
-    If programs use a column differently, the assumption is noted in the family file.
+    Programs differ in the meaning of some columns: `scale` may be a factor or a divisor. A comment in the
+    family file says which meaning was assumed.
     """
     found = _steps(cells)
     key, given = found[0] if found else ("scale", "")

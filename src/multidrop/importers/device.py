@@ -67,7 +67,7 @@ def serial_settings(
 ) -> LineSettings:
     """Return the settings of a serial line.
 
-    `keys` are the keys in `given` of the baud rate, data bits, parity and stop bits.
+    `keys` are the names of four entries in `given`: baud rate, data bits, parity, stop bits.
     """
     baudrate, bits, parity, stop = (given.get(key, "") for key in keys)
     parity = _PARITIES.get(str(parity).lower(), "")
@@ -165,7 +165,7 @@ class ImportedRegister:
     lacks: str = ""
     is_read: bool = True
     is_written: bool = False
-    of_writes: dict[str, Any] = field(default_factory=dict)  # further keys, if the register is written
+    of_writes: dict[str, Any] = field(default_factory=dict)  # keys of the family file for a written register
 
     def note_write(self, *, is_written: bool = True) -> None:
         """Record whether the source program writes the register; a write is noted in the family file."""

@@ -119,7 +119,7 @@ def _parts(document: Any) -> Iterator[dict[str, Any]]:
 
 
 def _kind_of(entity: Mapping[str, Any]) -> str:
-    """Return the kind of an entity in a list without kinds: the first kind that allows all of its keys."""
+    """Return the kind of an entity that does not state it: the first kind that has all of its keys."""
     return next((kind for kind, table in KEYS.items() if entity.keys() <= table.keys()), "sensor")
 
 

@@ -69,7 +69,8 @@ VERIFY_KEYS = key_table(imported="address input_type state_on state_off", irrele
 _DEFAULT_TABLES = {"sensors": "holding", "binary_sensors": "coil"}
 _NOT_READ = ("climates", "covers")
 _LEGACY_KINDS = {"sensor": "sensors", "binary_sensor": "binary_sensors", "switch": "switches"}
-_LEGACY_LISTS = {"registers": "", "inputs": "", "coils": "coil"}  # by key of a list: the table of its entries
+# key of a list of entities -> their table; "": each entity states its table
+_LEGACY_LISTS = {"registers": "", "inputs": "", "coils": "coil"}
 MOST_REPEATED = 1000  # limit of the key virtual_count
 _DEEPEST = 4  # limit of packages within packages
 
@@ -151,7 +152,10 @@ def _kind_of(entry: Mapping[str, Any]) -> str:
 
 
 def _legacy_hubs(kind: str, listed: Any, hubs: Any) -> Iterator[Mapping[str, Any]]:
-    """Yield a hub for each `platform: modbus`, the layout before 2021, with the present names of its keys."""
+    """Yield a hub for each `platform: modbus` of a configuration from before 2021.
+
+    Its keys are renamed to those that Home Assistant uses now.
+    """
     known = {
         str(hub.get("name", "modbus_hub")): hub
         for hub in (hubs if isinstance(hubs, list) else [hubs])
@@ -245,7 +249,7 @@ def _verify(register: ImportedRegister, entry: Mapping[str, Any]) -> None:
         written, table = register.address, str(verify.get("input_type", register.table))
         register.address = whole(verify, "address", written)
         if table not in _TABLES:
-            raise ValueError(f"its table {table[:40]!r} is not known")
+            raise ValueError(f"verify: its input_type {table[:40]!r} is not a known table")
         register.table = _TABLES[table]
         if register.address != written:
             register.gaps.append(f"it is written at another address, {written:04X}H")

@@ -19,7 +19,10 @@ _STRING = re.compile(r"string([0-9]{1,4})")
 
 
 def read_modpoll(rows: list[list[str]]) -> list[ImportedDevice]:
-    """Return the devices of a modpoll table. Raises ValueError for a row of another kind."""
+    """Return the devices of a modpoll table.
+
+    Raises ValueError for a row that starts with another word than "device", "poll" or "ref".
+    """
     devices: list[ImportedDevice] = []
     table = order = ""
     for number, row in enumerate(rows, 1):

@@ -17,7 +17,7 @@ GROUP_KEYS = key_table(
     imported="name label points groups", irrelevant="type count desc detail notes comments standards"
 )
 MODEL_KEYS = key_table(imported="id group", irrelevant="label desc detail notes comments standards")
-MOST_REPEATED = 1000  # limit of repetitions of a point
+MOST_REPEATED = 1000  # limit of registers of one point, SunSpec's word for a value
 FIRST = 40000  # assumed start address of a model, which its file does not state
 # Raw counts that mean "not implemented", by type (SunSpec information model specification, data types).
 _INVALID = {
@@ -44,7 +44,7 @@ def read_sunspec(document: Mapping[str, Any]) -> list[ImportedDevice]:
     device = ImportedDevice(title)
     reason = f"its place in the device is not in its file: {FIRST} is assumed, so mend every `at`"
     device.lose("the model", reason, is_entry=False)
-    names: dict[str, str] = {}  # by point that is a scale factor: the name of its register
+    names: dict[str, str] = {}  # point with a scale factor -> name of its register
     address = FIRST
     for point in group["points"]:
         size, count = _size(point), whole(point, "count", 1)
@@ -124,7 +124,7 @@ def _add(
 
 
 def _tie(register: ImportedRegister, names: Mapping[str, str]) -> None:
-    """Set the register's step if the point states it as a number, else the name of its scale register."""
+    """Set the step from a scale factor that is a number, or the scale register from one that is a point."""
     scale = register.details.pop("scale_register", None)
     if isinstance(scale, int):
         register.details["step"] = 10**scale if 0 <= scale <= 10 else float(f"1e{scale}")

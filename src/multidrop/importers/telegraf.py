@@ -67,7 +67,7 @@ PLUGIN_KEYS = key_table(
 
 
 class _Field(NamedTuple):
-    """A field of the plugin, with the settings of the tables that contain it."""
+    """A field of Telegraf's plugin inputs.modbus, with the settings of the TOML tables that contain it."""
 
     given: Mapping[str, Any]
     style: str
@@ -209,10 +209,10 @@ def _number(
 
 
 def _plain_type(style: str, kind: str, words: int) -> str:
-    """Return a type name that means the same in all styles.
+    """Return a type name that means the same in all configuration styles of the plugin.
 
-    In the register style, FLOAT32 is a whole number with a word for each address, and IEEE floats have names
-    that end in -IEEE.
+    In the style "register", FLOAT32 is a whole number of one word for each listed address; the type of a
+    float has a name that ends in -IEEE. In the other styles, FLOAT32 is a float.
     """
     if style != "register":
         return kind.removesuffix("-IEEE")

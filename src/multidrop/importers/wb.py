@@ -326,7 +326,7 @@ def _number_of_bits(register: ImportedRegister, format: str, bits: tuple[int, in
 
 
 def _invalid(register: ImportedRegister, entry: Mapping[str, Any]) -> None:
-    """Set the raw counts that mean "no value". For a float, the template states them as bit patterns."""
+    """Set the raw counts that mean "no value". For a float, the source file has them as bit patterns."""
     number = str(register.details.get("number_format", ""))
     bits = 8 if number == "I8" else 16 * words_of(number)
     found: list[float | str] = []

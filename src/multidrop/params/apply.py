@@ -23,7 +23,8 @@ from multidrop.params.values import ParameterSet
 from multidrop.transport import clock
 
 NotWritten = BusError | OSError | Outcome  # why a parameter was not written; str() gives a sentence
-# Called after each write: its number, the number of writes, the change, and why it failed (None: it did not).
+# Called after each write with its number from 1, the number of all writes, the change, and the reason of a
+# failure (None if the write succeeded).
 Report = Callable[[int, int, ParameterChange, NotWritten | None], None]
 
 
@@ -77,7 +78,7 @@ def apply_plan(made: ApplyPlan, *, commissioning: bool = False, report: Report |
 
 
 def _apply(made: ApplyPlan, stops: int, *, commissioning: bool, report: Report | None) -> Applied:
-    """Write a plan's parameters until the drive is stopped more than `stops` times."""
+    """Write a plan's parameters. `stops` is the number of stops so far: a further stop ends the writes."""
     drive = made.drive
     journal = _Journal(drive)
     result = Applied(made, earlier=journal.earlier())

@@ -165,7 +165,7 @@ def _from_csv(data: bytes) -> tuple[dict[str, str], dict[str, int]]:
         facts = {"model": GD20_MODEL, **facts}
     elif not {"code", "raw"} <= {*names}:
         if GD20_COLUMNS - {"valor_parametro"} <= {*names}:
-            raise ValueError("the file lists parameters without values; name the tool's backup, not its list")
+            raise ValueError("the file lists parameters without values; pass the PC tool's backup")
         raise ValueError("this is not a parameter file: its first row does not name the columns code and raw")
     found: dict[str, int] = {}
     try:

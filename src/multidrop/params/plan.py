@@ -165,7 +165,7 @@ def _check_no_run_command(drive: Drive) -> None:
 
 
 def _member(register: Register[Any] | None, name: str) -> Any:
-    """Return the register's value with this name, in upper or lower case; None if there is none."""
+    """Return the named value of a register; None if it has none of this name. `name` is in lower case."""
     if register is None or register.values is None or not register.readable:
         return None
     members: Any = register.values
@@ -194,7 +194,7 @@ _STOP = Advice.call("stop")
 
 
 def _bounds(family: Any, known: Mapping[str, Parameter]) -> dict[str, str]:
-    """Return the parameters that are limits of the `known` ones, as a map from register name to code."""
+    """Return the codes of all parameters that limit one of the `known` parameters, by register name."""
     names = {name for one in known.values() for name in (one.at_least, one.at_most) if name}
     return {one.name: code for code, one in parameters_of(family).items() if one.name in names}
 

@@ -111,7 +111,10 @@ def read(
 
 @dataclass
 class _Reader:
-    """Reads a drive's parameters, and learns which of them it lacks and how long a block it answers."""
+    """Reads a drive's parameters in blocks.
+
+    It finds out which parameters the drive does not have, and how many it returns in one read.
+    """
 
     drive: Drive
     total: int

@@ -269,7 +269,9 @@ DEVICE = HEAD + "[reading]\ndevice = { at = 3 }\nspeed = { at = 4, unit = 'Hz', 
         ),
     ],
 )
-def test_mistakes_in_identify_or_verb_are_reported(tmp_path: Path, section: str, mistakes: list[str]) -> None:
+def test_mistakes_in_identify_and_verb_sections_are_reported(
+    tmp_path: Path, section: str, mistakes: list[str]
+) -> None:
     first, rest = ("", DEVICE + section) if section.startswith("[") else (section + "\n", DEVICE)
     (tmp_path / "t.toml").write_text(first + rest)
     found: tuple[str, ...] = ()
@@ -283,7 +285,7 @@ def test_mistakes_in_identify_or_verb_are_reported(tmp_path: Path, section: str,
 WRONG_KEYS = [  # each text has one wrong key of a register
     ("harmless = [0]", "[reading] a: a reading is never written"),
     ("step = inf", "step = inf: the value is not a finite number; write step = 0.1"),
-    ("step = 0", "step = 0: the value makes every value 0; write step = 0.1"),
+    ("step = 0", "step = 0: every reading would be 0; write step = 0.1"),
     ("number_format = 'F31'", "number_format = 'F31': the value is not known; did you mean"),
     ("values = {}", "values is empty; leave it out"),
     (
@@ -488,7 +490,7 @@ groups = [{ code = "P00.", at = "0000H", count = 3 }, { code = "P", at = "1000H"
 """
 
 
-def test_parameters_section_of_a_family_file_gives_the_address_rule(tmp_path: Path) -> None:
+def test_parameter_addresses_are_computed_by_the_rule_in_a_family_file(tmp_path: Path) -> None:
     more = 'line = ["P00.00"]\npasswords = ["P001"]\nnever = { "P00.02" = "it starts a test" }\n'
     found = parameters_of(family(tmp_path, HEAD + RULE + more))
     assert {code: (one.name, one.address) for code, one in found.items()} == {

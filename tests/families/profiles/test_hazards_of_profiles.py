@@ -349,7 +349,7 @@ def test_reset_of_a_trip_that_only_a_power_cycle_clears_is_refused() -> None:
     line.runs()
 
 
-def test_start_of_an_optidrive_as_its_first_guide_describes_it_is_refused() -> None:
+def test_start_of_an_optidrive_with_the_old_status_word_is_refused() -> None:
     line = Line("optidrive-e3")
     line.sim.is_first_reading = True
     line.drive.set_frequency(20)
@@ -363,7 +363,8 @@ def test_start_of_an_optidrive_as_its_first_guide_describes_it_is_refused() -> N
     assert line.starts == []
 
 
-# register values of another make; a drive of this family may show one of them, for example before a restart
+# Register values that show another make. One value is no proof: a drive of the declared make may also have
+# it, for example before a restart.
 OF_ANOTHER = {
     "status": 0x0241,  # this status does not exist in PROFIdrive
     "station": 7,

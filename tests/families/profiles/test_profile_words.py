@@ -181,7 +181,7 @@ HINDRANCES = [
     ("danfoss-fc51", 0x0600, "is not ready"),
     ("danfoss-fc51", 0x0403, "hand mode"),
     ("optidrive-e3", 0x0000, "is not ready to run"),
-    ("optidrive-e3", 0x0100, "is not ready to run"),  # this status means "running" in the first guide
+    ("optidrive-e3", 0x0100, "is not ready to run"),  # in the first edition of the guide: the motor runs
     ("invt-goodrive", 5, "has no mains"),
     ("yaskawa-a1000", 0x4022, "does not take its commands from the line"),
     ("yaskawa-a1000", 0x8002, "is not ready"),
@@ -196,8 +196,8 @@ def test_error_of_a_refused_start_names_the_reason(model: str, status: int, sent
     assert all(frame[-5:] == "04 76" for frame in sent(found))
 
 
-def test_optidrive_as_in_its_first_guide_is_never_reported_as_stopped() -> None:
-    # the first guide says: "high byte 1: running"
+def test_running_optidrive_with_the_old_status_word_is_not_reported_as_stopped() -> None:
+    # the first edition of the drive's guide says: "high byte 1: running"
     found = wire("optidrive-e3", 0x0100, output_frequency=20.0)
     assert found.drive.state().condition is Condition.DECELERATING
     found = wire("optidrive-e3", 0x0000)
@@ -316,7 +316,7 @@ def numbered(words: Mapping[str, int], **facts: Any) -> Register[Any]:
 
 
 class Clone(Goodrive):
-    """A family with INVT's control words in which 5 and 6 are exchanged, and without jog words."""
+    """A family with INVT's control words: 5 and 6 are exchanged, and it has no words for a jog."""
 
     control = numbered(EXCHANGED)
 
@@ -332,7 +332,7 @@ def test_control_words_renumbered_by_a_family_are_sent() -> None:
     assert Goodrive.control.harmless == (5, 6, 8)
 
 
-def test_family_without_jog_words_sends_only_its_renumbered_stop() -> None:
+def test_a_family_with_its_own_control_words_sends_its_own_stop_word() -> None:
     drive: Any = Clone(1, confirmed=1)
     found = Wire(drive, {**FREE, "status": [drive.status.values(GD_RUNS), drive.status.values(GD_STANDBY)]})
     drive.stop()

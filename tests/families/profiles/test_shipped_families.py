@@ -29,7 +29,7 @@ every_family = table("name", SHIPPED)
 every_profile_family = table("name", OF_PROFILE)
 every_commanded_family = table("name", COMMANDED)
 
-# By family: short names that `place` uses for the manuals and public programs in the key `manual`.
+# family -> short names of its manuals and of public programs. The `place` of each register starts with one.
 EDITIONS = {
     "abb-acs355": ("ACS355", "ACS550-02/U2", "ACS550-01", "ACS550 p. 209"),
     "danfoss-fc51": ("FC 51", "FC 101", "FC 202", "MG02A4", "MG02C6"),
@@ -344,7 +344,7 @@ def own_registers(name: str) -> list[Register[Any]]:
 
 
 @every_family
-def test_family_files_of_the_package_name_sources_and_are_marked_untested(name: str) -> None:
+def test_every_shipped_family_is_marked_as_not_tried_on_hardware(name: str) -> None:
     family = shipped_family(name)
     assert issubclass(family, Profile) is (name in OF_PROFILE)
     assert "not tried on hardware" in family.title
@@ -533,7 +533,7 @@ def test_models_command_lists_installed_families_and_warns_of_broken_ones(
         ({"acme": "toy:__doc__"}, r"model 'acme' of package .* is not a subclass of multidrop.Drive"),
         (
             {"acme": "toy:Toy"},
-            r"model 'acme' of package .* has model = 'toy': give its entry point that name",
+            r"model 'acme' of package .* has model = 'toy': rename its entry point to 'toy'",
         ),
         ({"acmes": "toy:Toy"}, r"there is no model 'acme'; did you mean acmes"),
     ],

@@ -183,9 +183,9 @@ def _base(given: Mapping[str, Any], place: TomlPlace) -> type[Drive]:
 def _check_inherited(
     base: type[Drive], document: Mapping[str, Any], declared: Declared, texts: Iterable[str], place: TomlPlace
 ) -> None:
-    """Report each declaration in the file that would replace a part of the built-in family that it extends.
+    """Report each declaration that has the name of a part of the extended built-in family.
 
-    The replaced part might be a limit, or might prevent a start of the motor.
+    It would replace that part, which might be a limit, or might prevent a start of the motor.
     """
     if base not in MODELS.values():
         return

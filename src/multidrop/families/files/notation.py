@@ -52,11 +52,11 @@ class Counting:
         raise ValueError(f'"{text}" is not an address; write 0x2000, 8192, "2000H" or "40001"')
 
     def address_in_cell(self, text: str, table: str | None, default: str) -> tuple[int, str]:
-        """Do the same as `address` for a CSV cell, in which a number such as 40001 has no quotes.
+        """Return the address in requests and the table's name for an address in a CSV cell.
 
-        If the file states `counts_from`, every number in a cell is an address. Raises
-        ValueError for a number such as 40001 whose first digit is that of the register's table: the number
-        may be an address, or may mean the first register of the table.
+        A CSV cell has no quotes. If the file states `counts_from`, a number in a cell is an address. Raises
+        ValueError if the number may also mean a place in the register's table: 40001 may be an address, or
+        the first holding register.
         """
         text = text.strip()
         if text.isascii() and text.isdecimal():

@@ -154,7 +154,7 @@ def _step(value: Any) -> Any:
     if value == NOT_STATED:
         return None
     if _number(value) == 0:
-        raise ValueError("the value makes every value 0")
+        raise ValueError("every reading would be 0")
     return value
 
 
@@ -184,7 +184,7 @@ def _counts(value: Any) -> tuple[int, ...]:
 def _invalid(value: Any) -> tuple[float, ...]:
     listed = value if isinstance(value, list) else [value]
     if not listed or len(listed) > MOST_LISTED:
-        raise ValueError(f"the value is not 1 to {MOST_LISTED} raw counts")
+        raise ValueError(f"the value is not a list of 1 to {MOST_LISTED} raw counts")
     return tuple(math.nan if each in ("NaN", "nan") else _number(each) for each in listed)
 
 
@@ -192,7 +192,7 @@ def _part(value: Any) -> tuple[int, int]:
     first, dash, last = str(value).partition("-")
     ends = [end.strip() for end in (first, last if dash else first)]
     if isinstance(value, (bool, float)) or not all(end.isascii() and end.isdecimal() for end in ends):
-        raise ValueError("the value is neither a bit nor the first and the last of several bits")
+        raise ValueError("the value is not a bit's number or a range of bits")
     low, high = (int(end[:4]) for end in ends)
     if low > high:
         raise ValueError("the value is in the wrong order: give the lowest bit first")
@@ -419,7 +419,7 @@ class Declared:
     def _addresses(
         self, given: Mapping[str, Any], good: dict[str, Any], place: TomlPlace, read: ReadAddress
     ) -> tuple[int, str] | None:
-        """Return the register's address and table, None if invalid; also convert `ram_address` in `good`."""
+        """Return the register's address and table, None if invalid. Convert the `ram_address` in `good`."""
         if "at" not in given or ("table" in given and "table" not in good):
             good.pop("ram_address", None)
             return None

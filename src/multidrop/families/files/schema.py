@@ -90,7 +90,7 @@ def family_schema(tables: Sequence[str] = ()) -> dict[str, Any]:
 
 
 def _says(key: str, *values: object) -> dict[str, Any]:
-    """Return the condition that the section [family] has this key, with one of these values, if given."""
+    """Return the condition that the section [family] has this key, and one of `values` if there are any."""
     value = {"properties": {key: {"enum": [*values]}}} if values else {}
     return {"properties": {"family": {"type": "object", "required": [key], **value}}, "required": ["family"]}
 
@@ -110,11 +110,12 @@ _REFERENCES = "^(register|firmware|scale_register|at_least|at_most)$"
 
 
 def _references() -> dict[str, Any]:
-    """Return the definition "references" and its parts: keys such as `at_most` name a register or an option.
+    """Return the schema of keys such as `at_most`, whose value is the name of a register or an option.
 
-    A JSON Schema cannot look up a name, but it can match names against patterns: those of the length, of the
-    first two and of the last two characters. If no register or option matches a pattern, no key may have a
-    name that matches it. So every existing name is accepted, and many misspelt names are refused.
+    A JSON Schema cannot look up a name, but it can match names against patterns. Each pattern matches the
+    names of one length, or the names with one character at the start, second, last but one or at the end. If
+    no register or option matches a pattern, the value of a key must not match it either. So every existing
+    name is accepted, and many misspelt names are refused.
     """
     letters = [f"[{small}{small.upper()}]" for small in ascii_lowercase]
     characters = [*letters, "_", *digits]
@@ -191,7 +192,7 @@ def _addresses_of(table: str) -> dict[str, Any]:
 
 
 def _extending(name: str, base: type[Drive]) -> dict[str, Any]:
-    """Return the part of the schema for files that extend this family: they must not change it."""
+    """Return the schema of files that extend this family: they must not replace parts of the family."""
     taken = sorted({one for one in dir(base) if not one.startswith("_")} - {*TAKEN_NAMES})
     has_rule = {
         "parameters": base.parameter_space is not None,
@@ -212,9 +213,9 @@ def _extending(name: str, base: type[Drive]) -> dict[str, Any]:
 
 
 def _without_written(first: int, found: list[int]) -> dict[str, Any]:
-    """Return the part of the schema that forbids these addresses in files whose `counts_from` is `first`.
+    """Return the schema that forbids registers at the addresses `found` if `counts_from` is `first`.
 
-    The extended family writes its own registers at these addresses.
+    At these addresses, the family that the file extends has registers that it writes.
     """
     numbered = "|".join(f"{at + 1:04}" if at < 9_999 else f"{at + 1}" for at in found)
     in_table = {"type": "string", "pattern": rf"^\s*40?({numbered})\s*$"}
@@ -332,7 +333,8 @@ def _by_format() -> list[dict[str, Any]]:
 
 
 _IS_WRITTEN = {"not": {"required": ["never"]}}
-_HOLDING = {"properties": {"table": {"enum": ["holding", "HOLDING"]}}}  # the table is stated, or is left out
+# accepts the table of holding registers, and a register without the key `table`
+_HOLDING = {"properties": {"table": {"enum": ["holding", "HOLDING"]}}}
 _HOLDING_BY_DEFAULT = {"properties": {"default": _HOLDING}}
 
 

@@ -496,7 +496,7 @@ def _proof(table: Any, registers: Mapping[str, Register[Any]], place: TomlPlace)
         place.wrong(f"is = {values!r} is not right; write {PROOF_KEYS['is'].example}")
         return None
     if not good.keys() & {"is", "above", "below"}:
-        # otherwise the key exists, but is misspelt or has a wrong value
+        # a key that is misspelt or has a wrong value was reported above
         if len(place.config_errors) == before:
             place.wrong("says no value; add is = [0x010A], or above and below")
         return None

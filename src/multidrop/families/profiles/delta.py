@@ -26,9 +26,9 @@ class DeltaControl(IntEnum):
 
 
 class DeltaReset(IntEnum):
-    """Register 2002H: bit 1 resets a fault (MS300 manual p. 789).
+    """The words that the library writes to 2002H: bit 1 resets a fault (MS300 manual p. 789).
 
-    Bits 0 (fault) and 2 (base block) are not set.
+    The library never sets bit 0, which causes a fault, or bit 2, which blocks the output (base block).
     """
 
     NOTHING = 0
@@ -65,8 +65,9 @@ class Delta(Profile):
     - The role `fault` is required, because the status shows no fault. Only its low byte is used; the high
       byte of newer drives is a warning.
     - The direction is sent with every run. The word that toggles it is never sent.
-    - 2002H keeps its bits. The library writes 2 once and then 0, because a 2 left there would immediately
-      reset a later fault. Clearing bit 2, the base block, lets the motor continue, so a stop is sent first.
+    - The bits of 2002H stay set until they are cleared. To reset a fault, the library writes 2 and then 0: a
+      2 that stayed there would immediately reset a later fault. These writes also clear bit 2 (base block),
+      after which a motor with a run command continues to turn. So the library sends a stop first.
     - Bit 10 of the status says that the drive takes its commands from the line; a start requires it.
     - No control word lets the motor coast.
     """

@@ -108,7 +108,7 @@ class CiA402(Profile):
         reverse = {member.name: int(member) for member in self.control.values or ()}.get("REVERSE", 0)
         if direction is not None and not reverse:
             raise WriteForbidden(
-                f"{self.name}: the standard has no direction, and its family declares no bit for it; "
+                f"{self.name}: the standard defines no direction, and the family declares no direction bit; "
                 "start without a direction"
             )
         if direction is None and reverse and self._turns(status):

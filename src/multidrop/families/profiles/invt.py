@@ -187,5 +187,8 @@ class Inovance(Invt):
 
     @property
     def identity_is_weak(self) -> bool:
-        """True, because the stop word would run a drive with Delta's words, which `identify` may accept."""
+        """True, because `identify` may accept a drive with Delta's control words.
+
+        On such a drive, INVT's stop word is a run word.
+        """
         return True

@@ -29,9 +29,10 @@ _BY_PROFILE = "set by the profile; leave it out"
 
 @dataclass(frozen=True)
 class Role:
-    """A register that a profile uses, such as `control`; the profile sets its `values` and `harmless`.
+    """What a profile requires of a register that it uses, such as `control`.
 
-    `needed` is False if a family may omit the register.
+    The register gets `values` and `harmless` from its role; a family does not declare them. `needed` is False
+    if a family may omit the register.
     """
 
     access: tuple[Access, ...]
@@ -41,7 +42,7 @@ class Role:
     moves: bool | None = None
     units: tuple[str, ...] = ()  # allowed units; empty: any
     extra: tuple[str, ...] = ()  # names of bits that a family may add, because makes differ in these bits
-    renumbered: tuple[str, ...] = ()  # control words that a family with its own numbers must define
+    renumbered: tuple[str, ...] = ()  # words that a family with its own numbers must have
     needed: bool = True
 
     @property
@@ -257,12 +258,15 @@ class Profile(Drive):
 
     @classmethod
     def readings(cls) -> tuple[Register[Any], ...]:
-        """Return the registers that are polled by default: all readings except those that only identify."""
+        """Return the registers that are polled by default: all readings except proofs of the identity."""
         return tuple(one for one in super().readings() if one.name not in PROOFS)
 
     @property
     def identity_is_weak(self) -> bool:
-        """True without `signature` and [[identify]], because status and address may match by chance."""
+        """True if the family has neither a register `signature` nor a section [[identify]].
+
+        Without them, only the status and the drive's own address are checked, which may match by chance.
+        """
         return "signature" not in self.registers and not self.identity_proofs
 
     # ---- overridden by profiles ----
@@ -409,7 +413,7 @@ class Profile(Drive):
         return self._word(reverse if self._reverses(direction, status) else forward)
 
     def _word(self, count: int, role: str = "control") -> Any:
-        """Return a control word of the profile as a value of this register."""
+        """Return the named value of a raw count; `role` is the name of the register."""
         values = self.register(role).values
         assert values is not None
         return values(count)
