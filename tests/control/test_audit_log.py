@@ -258,7 +258,7 @@ async def test_an_author_set_in_one_task_or_thread_does_not_apply_in_others(audi
     assert audited.noted()[2:] == [("setpoint = 20.00 %", None, None)]
 
 
-def test_a_write_has_the_author_of_the_innermost_written_by_block(audited: Audited) -> None:
+def test_the_author_of_a_write_comes_from_the_innermost_block(audited: Audited) -> None:
     with written_by("anna", "web"):
         with written_by("boris"), suppress(ZeroDivisionError):
             audited.drive.set_frequency(20)
@@ -294,7 +294,7 @@ def test_with_an_invalid_author_only_a_stop_is_sent(
 ) -> None:
     bus, drive = audited.bus, audited.drive
     if is_way and who == "":
-        return  # an empty way is valid, unlike an empty author
+        return  # `way` may be empty, but an author may not
     drive.set_frequency(30)
     with written_by(*(("anna", who) if is_way else (who, "web"))):
         for call in (

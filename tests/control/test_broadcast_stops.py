@@ -130,7 +130,7 @@ class Quiet(Toy):
 
 
 @pytest.mark.parametrize("confirmed", [0, 1])
-def test_stop_all_broadcasts_no_command_that_is_not_a_stop(confirmed: int) -> None:
+def test_a_command_other_than_a_stop_is_not_broadcast_by_stop_all(confirmed: int) -> None:
     drives = [Quiet(address, confirmed=confirmed) for address in (1, 2)]
     line = SimulatedBus(*(simulated(drive) for drive in drives))
     for drive in drives:
@@ -147,7 +147,7 @@ def test_stop_all_broadcasts_no_command_that_is_not_a_stop(confirmed: int) -> No
 
 
 @every_broadcasting
-def test_a_broadcast_awaits_late_replies_unless_a_stop(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
+def test_a_broadcast_stop_does_not_wait_for_late_replies(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
     line, drives, _ = line_of(model, model)
     register = drives[0].control
     insists: list[bool] = []
@@ -228,7 +228,7 @@ def setpoint_of(drive: Any) -> Any:
 
 
 @table("model", SETTING)
-def test_after_leave_stops_are_broadcast_but_setpoints_are_refused(model: str) -> None:
+def test_only_a_stop_can_be_broadcast_after_the_bus_was_left(model: str) -> None:
     line, drives, _ = line_of(model, model)
     assert 0 in setpoint_of(drives[0]).broadcast
     line.bus.leave()
@@ -303,7 +303,7 @@ def test_a_stop_that_was_only_broadcast_is_reported_as_sent() -> None:
         assert "sent 1 times, it was never confirmed" in told.why
 
 
-def test_notes_of_an_interrupted_stop_all_count_the_broadcast_stop() -> None:
+def test_the_note_on_an_interruption_counts_the_broadcast_stop() -> None:
     line, _, _ = line_of("invt-che", "invt-che")
 
     line.fails = lambda request: KeyboardInterrupt() if broadcasts(line) and request.address else None

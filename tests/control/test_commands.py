@@ -154,7 +154,8 @@ class Motors:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("failure", [RuntimeError("can't start new thread"), MemoryError()])
-async def test_without_threads_no_stop_is_repeated_before_all(threads: Threads, failure: Exception) -> None:
+async def test_all_stops_are_sent_before_any_is_repeated(threads: Threads, failure: Exception) -> None:
+    """The system has no thread for the stops of two drives."""
     threads.threads, threads.failure = 1, failure
     motors = Motors(a=1, b=3, c=2)
     assert await motors.stop_all() == {"a": STANDS, "b": STANDS, "c": STANDS}
@@ -182,7 +183,9 @@ def test_if_no_thread_can_start_stops_do_not_block_the_event_loop(threads: Threa
     assert turns > 2
 
 
-async def test_a_stop_without_effect_ends_unknown(threads: Threads, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_the_result_of_a_stop_without_effect_is_unknown(
+    threads: Threads, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(commands, "STOP_S", 0.0)
     motors = Motors(a=1000)
     assert await motors.stop_all() == {"a": UNKNOWN}
@@ -208,7 +211,7 @@ def test_a_command_is_not_sent_if_no_thread_can_be_started(threads: Threads) -> 
     assert result.text == "can't start new thread"
 
 
-async def test_a_stop_without_threads_continues_if_its_caller_is_cancelled(threads: Threads) -> None:
+async def test_a_stop_in_the_event_loop_continues_if_its_caller_is_cancelled(threads: Threads) -> None:
     motors = Motors(a=2)
 
     (stopping,) = begin_stops([partial(motors.stop, "a")])
@@ -253,7 +256,7 @@ def on_threads(works: Sequence[StopWork]) -> list[StopFuture]:
     return [asyncio.get_running_loop().run_in_executor(None, work, None) for work in works]
 
 
-async def test_a_stop_called_while_another_stop_is_repeated_is_sent_but_not_repeated() -> None:
+async def test_a_further_stop_is_sent_once_while_the_first_is_repeated() -> None:
     pump, stops = NotedStops(), RepeatedStops(stop_noted, on_threads)
     drive: Any = pump
     repeated = asyncio.get_running_loop().create_future()
@@ -399,7 +402,7 @@ def test_a_stop_is_not_repeated_if_an_earlier_stop_used_up_its_time() -> None:
     assert timed.calls == [0.0]
 
 
-def test_a_flood_of_stops_is_joined_and_followed_by_a_stop() -> None:
+def test_a_flood_of_stop_requests_is_joined_into_one_later_stop() -> None:
     async def main() -> None:
         stops, begun, silent = JoinedStops(), list[int](), asyncio.Event()
 

@@ -130,7 +130,8 @@ def test_stops_are_sent_despite_a_full_disk(tmp_path: Path, caplog: pytest.LogCa
     ]
 
 
-def test_in_a_noted_first_block_a_full_disk_prevents_writes_but_not_stops(tmp_path: Path) -> None:
+def test_a_full_disk_prevents_writes_that_must_be_recorded_first(tmp_path: Path) -> None:
+    """Stops are sent nevertheless."""
     path = tmp_path / "audit.jsonl"
     line = SimulatedBus(simulated(InvtCHE(1, maximum_frequency=50)), audit=path)
     drive = line.attach(InvtCHE(1, maximum_frequency=50))
@@ -294,12 +295,14 @@ def test_setting_the_clock_back_does_not_restore_the_yearly_eeprom_budget(tmp_pa
     ledger = Ledger(tmp_path / "wear.sqlite", budget=10)
     for at in range(10):
         assert ledger.enter(CELL, NOON + at, 0.0) == ""
-    for set_back in (HOUR, 86400.0, NOON):  # by NOON: to 1970, as on a board without a battery
+    for set_back in (HOUR, 86400.0, NOON):  # NOON sets the clock to 1970, as on a board without a battery
         assert "10 times in a year" in ledger.enter(CELL, NOON - set_back, 0.0)
 
 
 @pytest.mark.long
-def test_a_clock_set_back_keeps_one_write_a_minute(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_one_write_a_minute_is_allowed_after_the_clock_is_set_back(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     """The EEPROM is written at most once a minute, and once more when the clock jumps back."""
     log = tmp_path / "audit.jsonl"
     line, drive, sim = one(DelixiModbus(1), audit=log)

@@ -125,7 +125,9 @@ def test_a_third_signal_within_a_second_ends_the_wait_for_stops(
     assert len(caught) == 1
 
 
-def test_a_third_signal_needs_no_standard_error(caught: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_third_signal_ends_the_wait_without_standard_error(
+    caught: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Standard error may be closed, or its terminal may be gone."""
 
     def write(fd: int, data: bytes) -> int:
@@ -252,8 +254,8 @@ def test_adding_an_action_at_exit_raises_if_no_signal_handler_can_be_installed(
     assert not acts[1].is_begun
 
 
-def test_the_librarys_handler_calls_the_earlier_handler_after_its_bus_was_closed(caught: list[int]) -> None:
-    """Other code may replace the library's handler, and install it again after the bus was closed."""
+def test_our_handler_calls_the_earlier_one_after_the_bus_was_closed(caught: list[int]) -> None:
+    """Another program part replaces our handler, and installs it again after the bus was closed."""
     hook = ExitHook()
     for comes_again in (False, True):
         made = hook.add(lambda: None, lambda: None)
@@ -289,8 +291,8 @@ def test_a_later_bus_handles_signals_that_the_program_took_over(caught: list[int
 
 
 @pytest.mark.parametrize("effect", ["called", "default", "ignored"])
-def test_the_programs_signal_handler_may_call_the_librarys_handler(caught: list[int], effect: str) -> None:
-    """After the stops, the handler from before the library's is called once, if there was one."""
+def test_a_later_handler_of_the_program_may_call_ours(caught: list[int], effect: str) -> None:
+    """The program has replaced our handler. After the stops, the handler before ours is called once."""
     hook, act, handled = ExitHook(), Act(), list[int]()
     if effect != "called":
         signal.signal(signal.SIGTERM, signal.SIG_DFL if effect == "default" else signal.SIG_IGN)
@@ -309,7 +311,7 @@ def test_the_programs_signal_handler_may_call_the_librarys_handler(caught: list[
     assert caught == ([signal.SIGTERM] if effect == "called" else [])
 
 
-def test_a_replaced_program_handler_may_call_the_librarys_earlier_handler(caught: list[int]) -> None:
+def test_a_handler_that_we_have_replaced_may_call_ours(caught: list[int]) -> None:
     hook, handled = ExitHook(), list[int]()
     hook.add(lambda: None, lambda: None)
     ours: Any = signal.getsignal(signal.SIGTERM)

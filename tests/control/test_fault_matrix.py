@@ -43,8 +43,9 @@ OUTCOMES: dict[str, type[BusError]] = {
     "!": WriteForbidden,
     "n": Unsupported,
 }
-# ok: done; ?: unconfirmed; x: refused by the drive; -: no reply, and no write was sent; !: forbidden.
-# After a slash: the outcome of the families in SECOND. A family without the verb always raises Unsupported.
+# The outcome of each verb, by situation and fault. ok: done; ?: unconfirmed; x: refused by the drive;
+# -: no reply, and no write was sent; !: forbidden. A family without the verb always raises Unsupported.
+# In a cell such as ok/?, the second outcome is that of the families in SECOND.
 TABLE = """
 situation verb          none lost-once lost never damaged exception late silent unreadable deaf echo
 fresh     set_frequency ok   ok/?      ok/? ?     ?       x         ok/? ?      ?          -    -
@@ -64,14 +65,17 @@ tripped   reset_fault   ok   ok/?      ?    ?     ok/?    x         ?/ok ?      
 """
 SEVERAL_WORDS = {"abb-acs355", "siemens-v20", "schneider-atv320"}  # a start takes several control words
 SECOND: dict[tuple[str, str], set[str]] = {
-    ("set_frequency", "?"): {"innovert-ibd", "delixi-native", "danfoss-fc51", "delta-vfd-el"},  # not readable
+    # the setpoints of these drives cannot be read back
+    ("set_frequency", "?"): {"innovert-ibd", "delixi-native", "danfoss-fc51", "delta-vfd-el"},
     # these drives read a limit or the present value before the write
     ("set_frequency", "-"): {"erman-er-g-220", "delixi-modbus", "yd1000"},
     ("start", "ok"): SEVERAL_WORDS,
     ("start", "-"): SEVERAL_WORDS,
-    ("start", "?"): {"yd1000"},  # a trip freezes its status
+    # this drive's status register does not change while the drive is tripped
+    ("start", "?"): {"yd1000"},
     ("start", "x"): {"yd1000"},
-    ("stop", "x"): {"erman-er-g-220", "innovert-ibd", "delixi-modbus", "yd1000"},  # no status of standstill
+    # these drives have no status that shows a motor at rest
+    ("stop", "x"): {"erman-er-g-220", "innovert-ibd", "delixi-modbus", "yd1000"},
     ("reset_fault", "?"): {"invt-che", "delixi-native"},  # one write resets the fault
     ("reset_fault", "ok"): {"yaskawa-a1000", "yd1000"},  # a reset takes several control words
 }

@@ -54,7 +54,9 @@ def be_silent(bus: Bus, drive: Any, received: ReceivedRequests) -> None:
     timeouts = bus.peer(drive).c
     timeouts.least_timeout_ns = timeouts.most_timeout_ns = 50_000_000
     received.loses = lambda request: True
-    earlier = bus.statistics().counters.sent - len(received.requests)  # requests that a test has cleared
+    earlier = bus.statistics().counters.sent - len(
+        received.requests
+    )  # earlier requests, which the test has removed
     with pytest.raises(NoReply):
         drive.read(next(register for register in drive.registers.values() if register.readable))
     # wait until the simulator has received the last request
@@ -77,7 +79,7 @@ def test_a_replaced_drive_is_not_started() -> None:
         assert received.writes == []
 
 
-def test_a_drive_replaced_while_its_write_is_counted_is_not_written(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_write_is_sent_after_the_drive_was_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
     """A locked ledger delays the write. During the delay, another line is plugged in."""
     line, drive, _ = one(YD1000(1))
 
@@ -111,7 +113,9 @@ def test_a_silent_drive_is_identified_before_a_write(model: str, monkeypatch: py
 @pytest.mark.parametrize("model", MAKE)
 @pytest.mark.usefixtures("_patient")
 @pytest.mark.parametrize("pause", ["idle", "asleep", "read since"])
-def test_a_drive_is_identified_after_10_s(model: str, pause: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_drive_is_identified_again_after_10_s_of_silence(
+    model: str, pause: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(records, "LEAST_INTERVAL", 0.0)
     with known(model) as (bus, drive, _received):
         drive.set_frequency(10)
@@ -255,7 +259,7 @@ def test_a_detached_drive_is_identified_again_before_a_stop() -> None:
     bus, drive, sim = one(InvtCHE(1, maximum_frequency=50))
     odd = [build_reply(Framing.RTU, Message(1, 3, data=bytes([0, device]))) for device in (3, 4)]
     bus.answers = lambda request: odd.pop(0) if odd else None
-    drive.stop()  # sent, because the two wrong identities differ
+    drive.stop()  # it is sent, because two different wrong identities prove nothing
     begun = len(bus.written)
     bus.bus.detach(drive)
     bus.attach(drive)
@@ -290,8 +294,10 @@ class Mute(Drive):
 
 
 @pytest.mark.parametrize("is_lost", [False, True])
-def test_a_first_stop_follows_a_read_without_waiting(monkeypatch: pytest.MonkeyPatch, is_lost: bool) -> None:
-    """The read shows whether the adapter echoes, before an echo could pass for the drive's confirmation."""
+def test_a_read_without_a_wait_precedes_the_first_stop(
+    monkeypatch: pytest.MonkeyPatch, is_lost: bool
+) -> None:
+    """The read shows whether the adapter echoes: an echo could be mistaken for the drive's confirmation."""
     bus = SimulatedBus(simulated(Mute(1)))
     drive, carry_out = bus.attach(Mute(1)), bus.carry_out
     asked: list[tuple[bool, bool]] = []
@@ -402,7 +408,7 @@ def test_a_lost_identity_check_is_not_repeated_before_the_stop(model: str) -> No
 
 
 @pytest.mark.parametrize("codes", [(3,), (3, 4)])
-def test_identity_replies_prove_no_other_family_unless_two_agree(codes: tuple[int, ...]) -> None:
+def test_a_stop_is_sent_unless_two_replies_show_the_same_family(codes: tuple[int, ...]) -> None:
     line, drive, _ = one(InvtCHE(1))
     odd = [build_reply(Framing.RTU, Message(1, 3, data=bytes([0, code]))) for code in codes]
     line.answers = lambda request: odd.pop(0) if odd else None
@@ -534,7 +540,7 @@ def test_no_stop_waits_for_the_second_identity_check_of_another_drive() -> None:
 
 
 @pytest.mark.parametrize("suspicions", [1, 2])
-def test_a_stop_by_a_plain_write_is_withheld_if_another_family_answers_twice(suspicions: int) -> None:
+def test_a_plain_stop_write_is_withheld_after_two_wrong_identities(suspicions: int) -> None:
     line, drive, _ = one(InvtCHE(1))
     odd = build_reply(Framing.RTU, Message(1, 3, data=b"\x01\x0a"))  # a Goodrive300L
     line.answers = lambda request: odd if len(line.frames) <= suspicions else None
@@ -574,7 +580,7 @@ def answers_as(line: SimulatedBus, counts: dict[int, int]) -> None:
     line.answers = answer
 
 
-def test_a_drive_that_lacks_another_makes_registers_is_checked_for_them_once() -> None:
+def test_registers_of_other_makes_are_read_only_before_the_first_write() -> None:
     """An INNOVERT IBD does not answer reads of registers that it lacks. Each such read delays polling."""
     line, drive, _ = one(InnovertIBD(1, confirmed=1))
     count_silences(line)
@@ -597,7 +603,7 @@ def test_another_make_is_recognised_although_its_first_reply_is_lost() -> None:
     assert line.written == []
 
 
-def test_every_other_make_is_excluded_after_an_earlier_silence() -> None:
+def test_other_makes_are_still_recognised_after_a_missing_reply() -> None:
     line, drive, _ = one(InnovertIBD(1, confirmed=1))
     count_silences(line)
     line.loses = lambda request: True

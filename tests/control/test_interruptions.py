@@ -157,7 +157,7 @@ def test_an_interrupted_stop_also_ends_a_jog() -> None:
     assert [request for request, _ in line.frames[-3:]] == sent
 
 
-def test_a_stop_that_only_reads_does_not_prevent_the_repetition_of_another() -> None:
+def test_a_stop_script_that_only_reads_does_not_delay_other_stops() -> None:
     sims: list[Any] = [simulated(Restless(1)), simulated(InvtCHE(2, maximum_frequency=50))]
     line = SimulatedBus(*sims)
     restless, other = (line.attach(sim.drive) for sim in sims)

@@ -49,13 +49,13 @@ def test_stops_on_exit_says_whether_stop_on_exit_was_called(pair: RunningPair) -
     assert pair.bus.stops_on_exit is True
 
 
-def test_leave_starts_the_stops_of_a_bus_immediately(pair: RunningPair) -> None:
+def test_drives_are_stopped_immediately_when_the_bus_is_left(pair: RunningPair) -> None:
     pair.bus.stop_on_exit()
     pair.bus.leave()
     until(lambda: pair.turning == [False, False])
 
 
-def test_leave_sends_no_stop_by_default(pair: RunningPair) -> None:
+def test_no_stop_is_sent_by_default_when_the_bus_is_left(pair: RunningPair) -> None:
     pair.bus.leave()
     pair.bus.part()
     assert pair.turning == [True, True]

@@ -125,7 +125,7 @@ def test_a_port_without_a_device_is_identified_by_its_name() -> None:
         ("socket://10.0.0.7:4001", "rfc2217://10.0.0.7:4001"),
     ],
 )
-def test_ledger_entries_of_older_versions_count_for_the_same_port(old: str, spelt: str) -> None:
+def test_ledger_entries_with_an_older_name_of_the_port_are_counted(old: str, spelt: str) -> None:
     with TemporaryDirectory() as folder:
         Path(folder, "device").touch()
         Path(folder, "link").symlink_to("device")
@@ -141,7 +141,7 @@ def test_ledger_entries_of_older_versions_count_for_the_same_port(old: str, spel
             assert [(each.cell.port, each.writes) for each in ledger.wear(1003.0)] == [(now, 3)]
 
 
-def test_registers_in_ram_are_not_counted(tmp_path: Path) -> None:
+def test_writes_to_registers_in_ram_are_not_in_the_ledger(tmp_path: Path) -> None:
     class Fan(Drive):
         """A user's own drive."""
 
@@ -191,7 +191,7 @@ def test_writes_to_a_simulated_drive_are_not_in_the_user_s_ledger(tmp_path: Path
     with toys(str(tmp_path / "link") if port == "link" else port) as sim:
         path = sim.wires[0].path.replace("0.0.0.0", "127.0.0.1")
         write(path, 12.0)
-        # the limit of a real drive
+        # the ledger limits the writes to a simulated drive too, but in a file of its own
         with pytest.raises(WriteForbidden, match="is written once in 60 s at most"):
             write(path, 13.0)
     assert Ledger().wear(0) == []

@@ -127,7 +127,7 @@ def test_no_call_sends_before_the_process_is_master(scene: Scene, call: Callable
     begun = time.monotonic()
     with pytest.raises(NotMaster) as failure:
         call(scene)
-    assert time.monotonic() - begun < 25  # a stop is not repeated for 30 s
+    assert time.monotonic() - begun < 25  # a stop would otherwise be repeated for 30 s
     assert not failure.value.is_sent
     assert not failure.value.heard
     assert scene.requests == 0
@@ -148,7 +148,7 @@ def test_no_call_sends_once_the_process_is_no_longer_master(scene: Scene, call: 
     assert scene.requests == before
 
 
-def test_a_request_that_only_the_master_may_send_is_no_failure_of_the_drive(scene: Scene) -> None:
+def test_requests_without_mastership_do_not_count_as_drive_failures(scene: Scene) -> None:
     for _ in range(3):
         with pytest.raises(NotMaster):
             scene.drive.read(Toy.output_current)
@@ -436,7 +436,7 @@ def test_a_stop_on_an_unopened_port_says_it_was_not_sent(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize("port", ["rfc2217://127.0.0.1:4001", "loop://", "spy:///dev/null"])
-def test_a_port_handled_by_pyserial_is_refused_with_a_mastership(port: str) -> None:
+def test_a_bus_with_a_mastership_refuses_ports_that_pyserial_opens(port: str) -> None:
     with pytest.raises(
         NoSuchPort, match="a line with a mastership needs a port that the core writes to itself"
     ):

@@ -92,7 +92,7 @@ def test_a_verb_returns_the_result_of_its_script() -> None:
 
 
 @table("model", MAKE)
-def test_verbs_without_a_result_return_a_command_result(model: str) -> None:
+def test_set_frequency_start_and_stop_return_a_command_result(model: str) -> None:
     _, drive, _ = one(MAKE[model](1))
     for result in (drive.set_frequency(20), drive.start(), drive.stop()):
         assert result.ok
@@ -100,7 +100,7 @@ def test_verbs_without_a_result_return_a_command_result(model: str) -> None:
     assert isinstance(drive.state(), State)
 
 
-def test_a_start_script_that_catches_cancelled_by_stop_ends_anyway() -> None:
+def test_a_start_ends_after_a_stop_even_if_its_script_continues() -> None:
     line, drive = stubborn()
     call_stop_at(line, drive, 1)
     with pytest.raises(
@@ -200,7 +200,7 @@ def test_a_reversal_returns_once_the_motor_is_seen_to_turn_in_reverse(model: str
     line, drive, sim = turning(model)
     drive.start(Direction.REVERSE)
     assert drive.state().direction is Direction.REVERSE
-    if model not in ("yd1000", "delta-vfd-el"):  # these simulations show the commanded direction
+    if model not in ("yd1000", "delta-vfd-el"):  # these two report the commanded direction
         assert sim.motor.frequency < 0
     begun = line.seconds
     drive.start(Direction.REVERSE)  # the motor already turns in this direction
@@ -271,7 +271,7 @@ def test_a_reset_whose_effect_cannot_be_read_is_unconfirmed() -> None:
         drive.reset_fault()
 
 
-def test_a_write_refused_by_the_eeprom_write_budget_sets_is_budget(tmp_path: Path) -> None:
+def test_an_error_shows_whether_the_write_budget_was_the_reason(tmp_path: Path) -> None:
     line, drive, _ = one(DelixiModbus(1), ledger=tmp_path / "wear")
     drive.write(drive.frequency, 12.0)
     with pytest.raises(WriteForbidden, match="was written 0 s ago") as refusal:

@@ -154,7 +154,7 @@ class Nameless(Ramped):
     identify = Drive.identify
 
 
-def test_a_ramp_of_an_unconfirmed_drive_is_refused() -> None:
+def test_a_ramp_is_refused_without_the_option_confirmed() -> None:
     line, drive, _ = ramped(Nameless, confirmed=0)
     with pytest.raises(WriteForbidden, match="confirmed = 1"):
         ramp(drive, 2.0, rate=1.0)
@@ -187,7 +187,7 @@ def test_drives_waiting_for_a_staggered_start_are_read_regularly(gap: float) -> 
     assert 4 * gap <= line.seconds - begun < 4 * gap + 10
 
 
-def test_no_start_follows_a_suspension_between_staggered_starts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_staggered_start_is_sent_after_the_computer_slept(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drives, sims = che_drives(2)
 
     def sleep(seconds: float) -> None:
@@ -296,7 +296,8 @@ class NoThread(threading.Thread):
         raise RuntimeError("can't start new thread")
 
 
-def test_without_threads_all_started_drives_get_a_stop_before_a_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_started_drive_is_sent_a_stop_before_one_is_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A staggered start has failed, and the system has no thread for the stops."""
     _, drives, sims = che_drives(2)
     sims[1].trip(4)
     noted = NotedCalls(drives)

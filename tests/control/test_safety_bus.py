@@ -143,7 +143,7 @@ def test_only_the_first_write_follows_an_identity_check(monkeypatch: pytest.Monk
     assert looks == ["look"]
 
 
-def test_an_unidentified_innovert_ibd_needs_confirmed_for_writes() -> None:
+def test_an_unidentified_innovert_ibd_is_written_only_if_confirmed() -> None:
     for confirmed in (0, 1):
         line, drive, sim = one(InnovertIBD(1, confirmed=confirmed))
         sim["address_setting"] = 0
@@ -345,7 +345,7 @@ def test_a_start_is_refused_if_another_client_changed_the_setpoint() -> None:
     assert not sim.motor.energised
 
 
-def test_a_setpoint_that_the_drive_limits_raises_not_verified(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_is_raised_if_the_drive_limits_a_setpoint(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, sim = one(ErmanERG220(1))
     accept = type(sim).accept
     monkeypatch.setattr(

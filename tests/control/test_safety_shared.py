@@ -159,7 +159,7 @@ def shared(drives: str, baudrate: int, seed: int) -> Iterator[SharedPair]:
 
 
 RTU_FAMILIES = [model for model in MAKE if model != "delixi-native"]
-ROUNDS, MOST_ROUNDS = 3, 60  # after ROUNDS, the first collision ends the test
+ROUNDS, MOST_ROUNDS = 3, 60  # least and greatest number of starts; more than ROUNDS only until a collision
 
 
 @contextmanager
@@ -312,7 +312,7 @@ MOMENTS = [("start", says) for says in SAYS] + [
 @pytest.mark.slow
 @patient
 @pytest.mark.parametrize(("verb", "says"), usually(*MOMENTS))
-def test_frames_of_another_client_do_not_confirm_a_pulse(verb: str, says: str) -> None:
+def test_frames_of_another_client_do_not_confirm_a_start_or_a_reset(verb: str, says: str) -> None:
     with shared_line("invt-che", seed=3) as (drive, pair, received):
         set_frequency(drive, 20)
         if verb == "reset_fault":
@@ -355,7 +355,7 @@ def test_an_equal_stop_of_another_client_confirms_our_stop() -> None:
 @pytest.mark.slow
 @patient
 @pytest.mark.parametrize("verb", ["stop", "coast"])
-def test_another_clients_equal_request_is_not_taken_for_an_echo_for_long(verb: str) -> None:
+def test_a_stop_is_confirmed_after_a_request_that_looked_like_an_echo(verb: str) -> None:
     """Our read is lost. The other client's equal request looks like our echo. A later stop is confirmed."""
     look = rtu("01 03 10 01 00 01")
     with shared_line("invt-che", seed=3) as (drive, pair, received):

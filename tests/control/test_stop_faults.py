@@ -93,7 +93,7 @@ def check_failing(nth: int, failure: type[BaseException], all_of_them: bool) -> 
 @pytest.mark.parametrize("failure", [KeyboardInterrupt, MemoryError])
 @pytest.mark.parametrize("all_of_them", usually(False, True))
 @pytest.mark.parametrize("step", [*usually(1999, 331), pytest.param(67, marks=pytest.mark.nightly)])
-def test_a_stop_that_fails_at_any_opcode_is_sent_and_leaves_nothing_behind(
+def test_a_stop_is_sent_although_it_fails_at_any_bytecode(
     failure: type[BaseException], all_of_them: bool, step: int
 ) -> None:
     first = FIRST_OPCODES + 1
@@ -109,7 +109,7 @@ def test_a_stop_called_by_a_signal_handler_cancels_the_interrupted_start(verb: s
     line, (drive,), (sim,) = che_drives(runs_s=10)
     drive.stop()
     stop = line.bus.stop_all if verb == "stop_all" else getattr(drive, verb)
-    start, first = drive.start, 9  # at an earlier opcode the stop precedes the start
+    start, first = drive.start, 9  # a stop before bytecode 9 would come before the start
     for nth in chain(range(first, first + 80, 4), count(first + 80, 499)):
         with calling_at(nth, is_ours, stop) as place, suppress(CancelledByStop, Unconfirmed):
             start()
@@ -153,7 +153,9 @@ def fails_to_start_the_last(line: SimulatedBus, drives: list[Any], sims: list[An
 
 
 @pytest.mark.long
-def test_an_interrupted_stop_of_a_failed_staggered_start_stops_all(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_started_drives_are_stopped_although_a_stop_is_interrupted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     class OwnThread(threading.Thread):
         """A thread that does its work in `start`."""
 
@@ -259,7 +261,7 @@ def test_a_stop_that_cannot_be_made_raises_memory_error_after_30_s(monkeypatch: 
     assert len(line.written) == before
 
 
-def test_the_error_of_a_stop_without_resources_names_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_result_of_a_stop_says_that_no_descriptor_was_left(monkeypatch: pytest.MonkeyPatch) -> None:
     line, _, _ = che_drives(runs_s=10)
 
     def failing(exchange: Exchange, **details: Any) -> Completion:
@@ -288,7 +290,7 @@ def test_a_stop_accepts_any_number_type_for_seconds(seconds: Any) -> None:
 
 
 @pytest.mark.slow
-def test_a_repeated_stop_tries_to_open_a_locked_ledger_only_once(
+def test_a_repeated_stop_opens_a_locked_eeprom_ledger_only_once(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     ledger = Ledger(tmp_path / "wear")
@@ -401,6 +403,6 @@ def check_stops(family: str, failure: str, step: int) -> None:
 @pytest.mark.usefixtures("_unbounded")
 @pytest.mark.parametrize("step", first_in_ci(37, 11))
 @pytest.mark.parametrize(("family", "failure"), in_turn(FAMILIES, [*FAILURES]))
-def test_a_motor_is_stopped_although_its_stop_fails_at_any_line(family: str, failure: str, step: int) -> None:
+def test_a_motor_is_stopped_although_any_line_of_code_fails(family: str, failure: str, step: int) -> None:
     """Steps are prime, so that they reach different lines of loops. With step 1, a run takes 15 minutes."""
     check_stops(family, failure, step)

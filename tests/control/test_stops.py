@@ -303,7 +303,7 @@ def test_a_lost_read_is_not_repeated_before_the_stop_is_sent_again() -> None:
     assert [is_write(request) for request, _ in line.frames[begun : begun + 3]] == [True, False, True]
 
 
-def test_only_later_writes_of_a_stop_wait_for_late_replies(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_waits_for_late_replies_only_after_its_first_write(monkeypatch: pytest.MonkeyPatch) -> None:
     """Waiting lets a stop be confirmed if replies are late. It does not delay other drives' first stops."""
     line, drive, _ = one(InvtCHE(1, maximum_frequency=50))
     line.bus.check_identity(drive)

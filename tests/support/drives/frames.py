@@ -26,7 +26,7 @@ def _line(text: str) -> str:
     return f":{text}\\r\\n"
 
 
-# Printed request: its message, then the message of each printed reply; "same" means a copy of the request.
+# The meaning of each printed request and of its printed replies. "same" is a reply that copies its request.
 MEANING: dict[str, tuple[Message, dict[str, Message | FrameFault]]] = {
     "01 01 00 00 00 0C 3C 0F": (
         Message(1, 0x01, 0, 12),
@@ -42,7 +42,7 @@ MEANING: dict[str, tuple[Message, dict[str, Message | FrameFault]]] = {
             "01 83 03 01 31": Message(1, 0x03, exception=3),
         },
     ),
-    "01 04 00 01 00 05 61 C9": (  # erratum E1, with a corrected checksum
+    "01 04 00 01 00 05 61 C9": (  # erratum E1: here the checksum is corrected
         Message(1, 0x04, 1, 5),
         {
             # erratum E2: wrong byte count

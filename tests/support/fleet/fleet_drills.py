@@ -32,8 +32,9 @@ from multidrop.fleet.servers.connections import ServerPath
 
 GATEWAYS = ("gw-a", "gw-b", "gw-c")
 PATIENCE_S = 120.0
-JUDGED_S = 11.0  # s for which lines are watched after an attack, because an election may start 9 s after it
-SOON_S = 2.0  # s for which lines are watched if `settle` follows, which waits for elections itself
+# Lines are watched for so many seconds after an attack, because an election may start 9 s after it.
+JUDGED_S = 11.0
+SOON_S = 2.0  # the same in a test that then calls `settle`, which itself waits for elections
 
 
 class CommandEnd(NamedTuple):

@@ -33,7 +33,8 @@ PASS_EVERY = 10  # one in ten requests of the second master reads an unpolled re
 ASKED_ONES = 200  # requests that a stalled viewer sends without reading a reply
 PATIENCE_S = 30.0
 ROUND_S = 1.0  # s before a user reconnects
-WORDS, COMMON, COMMON_WORDS = 10, 0xF000, 6  # number of polled registers; common block: address, size
+WORDS = 10  # number of polled registers
+COMMON, COMMON_WORDS = 0xF000, 6  # address and size of the block shared by several drives
 
 SERVE = """[serve]
 listen = "127.0.0.1:{http}"

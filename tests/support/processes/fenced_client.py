@@ -45,7 +45,7 @@ def live(
     observer: socket.socket, lease: float, guard: float, timer: float, beyond: float, ports: list[str]
 ) -> None:
     mastership = Mastership(guard)
-    mastership.guard_s = timer  # used only by the kernel's timer; claims still use `guard`
+    mastership.guard_s = timer  # now read only by the kernel's timer
     drives = [
         PolledDrive(Counted(1, name=f"drive-{n}"), (Polled(Counted.number, None),)) for n in range(len(ports))
     ]

@@ -98,7 +98,7 @@ def apply(port: str, file: str, report: str) -> None:
 
 
 def main() -> None:
-    await_turns(setattr, dict.__setitem__)  # a busy machine delays writes for more than a second
+    await_turns(setattr, dict.__setitem__)  # a write may wait for more than a second on a busy machine
     for line in sys.stdin:
         process = os.fork()
         if process == 0:

@@ -86,7 +86,8 @@ class Network:
         net = f"10.{100 + os.getpid() % 50}.{(os.getpid() // 50 + 25 * nth) % 250}"
         self.address = f"{net}.1"
         self.namespaces: list[Namespace] = []
-        # Without its own MAC address a bridge uses a port's, and cutting that port would block the others.
+        # The bridge gets its own MAC address. Otherwise it would use the address of one of its ports, and
+        # cutting that port would block the others.
         _ip("link", "add", self._bridge, "address", BRIDGES_CARD, "type", "bridge")
         try:
             _ip("addr", "add", f"{self.address}/24", "dev", self._bridge)

@@ -283,7 +283,7 @@ class ClockedLine:
         self.reopen()
         return self
 
-    regain = reopen  # like `reopen`, because the poller has dropped the lost line
+    regain = reopen  # the poller has already closed the lost port
     is_lost = False  # unused, because no test here stops a motor
 
 
@@ -413,7 +413,7 @@ class ClockedLines:
 
     def _pass_time(self, seconds: float) -> None:
         for thread in threading.enumerate():
-            # the thread would take real time; reopening takes none on this clock
+            # wait for this thread, which reopens a port: on the simulated clock this takes no time
             if thread.name == "multidrop reopening":
                 thread.join()
         try:

@@ -15,7 +15,7 @@ from multidrop import bus
 from multidrop.core import Peer
 from multidrop.transport import peers
 
-PATIENCE = 60.0  # s, the longer timeout
+PATIENCE = 60.0  # s; each shorter timeout of the library is replaced by this one
 
 
 def patient_peer(*, interval: float, **timeouts: float) -> Peer:

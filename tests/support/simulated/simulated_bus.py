@@ -29,6 +29,7 @@ EXCHANGE_TIME = 0.02  # duration of an exchange in s
 TIMEOUT = 0.3
 
 READING = {1, 2, 3, 4}
+# modules and names that a SimulatedBus replaces
 REPLACED = [(bus, "Line"), (peers, "_former")]
 REPLACED += [(clock, name) for name in ("sleep", "now_ns", "boottime_ns", "utc_minus_monotonic_ns")]
 
@@ -73,7 +74,7 @@ class SimulatedBus:
         self.queue = object()  # as long as this is not None, the port counts as open
         self.has_echo = False
         self.port = self.identity = "hall"
-        replacements = (  # in the order of REPLACED
+        replacements = (  # one for each name in REPLACED, in the same order
             lambda port, *facts: self,
             {},  # forget timing that was learnt on another clock
             self.sleep,

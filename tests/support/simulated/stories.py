@@ -146,7 +146,8 @@ def _longest_gap(rows: Sequence[Row]) -> float:
 
 # ---- paths that delay all bytes and keep their order, such as a modem, a gateway, a stalled network ----
 
-Delay = Callable[[float], float]  # takes the s at which bytes enter the path; returns their delay in s
+# argument: time in s at which bytes enter the path; result: their delay in s
+Delay = Callable[[float], float]
 
 SECONDS = 150.0  # duration of a run; longer than the 120 s for which a line remembers pending requests
 TAIL = 20.0  # s; every drive must reply during these last seconds plus TURNS times the delay
