@@ -203,7 +203,7 @@ class Supervisor:
 
     @property
     def hung(self) -> dict[str, str]:
-        """A sentence for each name whose work takes longer than its limit."""
+        """A sentence about each work that takes longer than its limit, by the name of the work."""
         now = monotonic()
         late = {one.name: one for one in reversed(self._works.values()) if now - one.begun > one.limit_s}
         return {name: f"it has gone on for {now - one.begun:.0f} s" for name, one in late.items()}

@@ -34,7 +34,7 @@ from multidrop.plant import drive_meant
 from multidrop.supervisor import supervisor
 
 MOST_AGE_S = 5.0  # age limit, in s, of writes and verbs when they arrive; stops have none
-LOOK_S = 0.02  # pause between two checks for drives that a reload has changed during their stop
+LOOK_S = 0.02  # interval, in s, of checks whether a reload has changed a drive that is being stopped
 MOST_WRITES = 8  # limit of concurrent writes on one line; stops are not counted
 # Values of the field `rule` of WriteForbidden.
 BUSY = "too many writes are under way"
@@ -360,12 +360,14 @@ async def stop_meant(
     drives: Iterable[str] | None,
     stop: Callable[[Plant, list[str]], Coroutine[Any, Any, dict[str, CommandResult]]],
 ) -> dict[str, CommandResult]:
-    """Stop the drives with these names, or all if None; return the result of each drive's latest stop.
+    """Stop the drives with these names, or all drives if None. Return the newest result of each drive.
 
     A name may be spelled differently from the plant file (see `drive_meant`). `stop` is called with the
-    present plant and the names. If a reload changes a drive before all stops have ended, that drive is
-    stopped again as soon as it is attached. If the plant's lines have changed since the first stop, each
-    failed stop is repeated once, after the other stops.
+    present plant and the names.
+
+    A reload may change a drive while stops are in progress. The changed drive is stopped again as soon as it
+    is attached. A reload may also change the plant's lines. Failed stops are then sent once more, after all
+    other stops.
     """
     known = names_of(lines)
     meant = {name: drive_meant(name, known) for name in drives or ()}

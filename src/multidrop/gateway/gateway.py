@@ -264,7 +264,7 @@ class Gateway:
             await asyncio.sleep(TAKE_S)
 
     def hand_out(self, poller: Poller) -> None:
-        """Give all new polled values to the hub and to each part; the failure of one stops no other."""
+        """Give all new polled values to the hub and to each part. If one fails, the others still get them."""
         while batch := poller.take():
             self._has_news = True
             batch = self.reload.without_changed_drives(batch)

@@ -196,9 +196,9 @@ class AlarmQueue:
             self.left_out += excess
 
     def next(self, now_s: float) -> tuple[Alarm | None, float]:
-        """Return the alarm to send now, and 0.
+        """Return the alarm to send now, and a waiting time of 0 s.
 
-        If there is none, return None and how long to wait, in s (inf: no alarm waits).
+        If no alarm may be sent now, return None and the waiting time, in s; inf if no alarm waits.
         """
         rate = self._most / 3600
         self._allowed = min(self._most, self._allowed + (now_s - self._filled_s) * rate)
@@ -211,8 +211,9 @@ class AlarmQueue:
         return self._waiting[0], 0.0
 
     def note_sent(self, alarm: Alarm, left_out: int) -> None:
-        """Remove an alarm that `next` returned, because its message, which states `left_out`, was sent."""
-        # while the message was sent, more alarms may have been left out, maybe also this one
+        """Remove a sent alarm. Its message stated that `left_out` alarms were not sent."""
+        # Meanwhile a full queue may have dropped more alarms. If it dropped this one, do not count it: it was
+        # sent.
         is_left_out = all(one is not alarm for one in self._waiting)
         self._remove(alarm)
         self._allowed -= 1
@@ -283,7 +284,7 @@ class Sender(RetryingSender):
         self.announce()
 
     def _may_end(self, pause_s: float) -> bool:
-        # do not end before the messages that the hourly limit still allows are sent
+        # before the end, send all messages that the hourly limit allows
         return pause_s > 0 and not self._has_news
 
     def step(self) -> float:

@@ -41,7 +41,7 @@ PARTS: Mapping[str, str] = {
     "trigger": "multidrop.gateway.live.triggers",
     "upload": "multidrop.gateway.forward.upload",
 }
-# by library that several parts need: the extra of multidrop that installs it
+# extras of multidrop, by the library that they install
 EXTRAS = {"pyarrow": "parquet", "psycopg": "postgres"}
 
 # A function that reads any registers of a drive, whether the drive declares them or not. Its arguments are

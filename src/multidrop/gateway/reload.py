@@ -132,8 +132,8 @@ class Reload:
         plant, settings, planned = await self._read_within(self._read)
         is_followed = not isinstance(poller, Poller)
         if is_followed and (plant.lines or settings.parts.get("fleet") != gateway.settings.parts["fleet"]):
-            raise ValueError(f"[serve.fleet] and [[line]]: a change of either {RESTART}")
-        if gateway.audit:  # the poller opens the audit log when it gets the plant
+            raise ValueError(f"a change of [serve.fleet] or [[line]] {RESTART}")
+        if gateway.audit:  # check it before `poller.adopt` opens it
             await supervisor().within("audit log", AUDIT_S, partial(check_writable, gateway.audit))
         await gateway.parts.replace(settings.parts, plant)
         gateway.hand_out(poller)

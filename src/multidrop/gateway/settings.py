@@ -196,9 +196,9 @@ def read_plant(load: Callable[[], Plant], environment: Mapping[str, str]) -> tup
 
 
 def _check_followed(plant: Plant, settings: ServeSettings) -> None:
-    """Check the settings of a plant file without lines. Its gateway shows a fleet's drives.
+    """Check the settings of a gateway that shows a fleet's drives. Its plant file has no [[line]] tables.
 
-    Raises PlantError for settings that need lines in the plant file.
+    Raises PlantError for settings that need such tables.
     """
     place = replace(TomlPlace.in_file(plant.path), steps=(("serve", 1),))
     for name, other in NOT_FOLLOWED.items():
@@ -384,9 +384,9 @@ def _are_one_port(one: ListenAddress, other: ListenAddress) -> bool:
 
 
 def _settings_of(part: str) -> tuple[Any, dict[str, Key]]:
-    """Return the dataclass of a part's settings, and the keys of the part's table.
+    """Return the settings class of a table such as [serve.mqtt], and the table's keys.
 
-    The metadata of each field of the dataclass are JSON Schema keywords for its key.
+    The class has a field for each key. A field's metadata are the JSON Schema keywords of its key.
     """
     made = import_module(PARTS[part]).Settings
     return made, {one.name: _key_of(one) for one in fields(made) if one.init}
@@ -441,18 +441,14 @@ def _digest(paths: Iterable[Path]) -> str:
     return hashlib.sha256(b"".join(path.read_bytes() for path in paths)).hexdigest()
 
 
-def _check_audit(path: Path) -> bool:
-    """Raise ValueError if the audit log cannot be written.
-
-    Return True if it can be written, or if its disk hangs.
-    """
+def _check_audit(path: Path) -> None:
+    """Raise ValueError if the audit log cannot be written. A hanging disk is no error."""
     with suppress(Hung):
         in_time("audit log", AUDIT_S, partial(check_writable, path))
-    return True
 
 
-def check_writable(path: Path) -> bool:
-    """Return True if this audit log can be written. Raises ValueError if it cannot."""
+def check_writable(path: Path) -> None:
+    """Raise ValueError if this audit log cannot be written."""
     is_new = not path.exists()
     try:
         with path.open("ab"):
@@ -461,4 +457,3 @@ def check_writable(path: Path) -> bool:
         raise ValueError(f"audit {path} cannot be written: {failure.strerror}") from failure
     if is_new:
         path.unlink(missing_ok=True)
-    return True

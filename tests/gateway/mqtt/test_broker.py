@@ -200,7 +200,7 @@ def test_few_received_messages_wait_for_the_event_loop(monkeypatch: pytest.Monke
     )
     monkeypatch.setattr(broker, "loop", loop)
     monkeypatch.setattr(
-        broker._speaker, "received", lambda topic, payload, **more: handled.append(payload[0])
+        broker._messages, "received", lambda topic, payload, **more: handled.append(payload[0])
     )
 
     def receive() -> None:

@@ -105,7 +105,7 @@ def test_messages_without_a_connection_are_counted_as_dropped(tmp_path: Path) ->
         # JSON has one message for each of two drives; Sparkplug sends only changes
         assert (of_json.dropped, of_sparkplug.dropped) == (2, 0)
         for frequency in (1.0, 2.0):
-            part._speakers[0]._hub.values["pump-1", "output_frequency"] = frequency
+            part._formats[0]._hub.values["pump-1", "output_frequency"] = frequency
             running.step()
         assert (of_json.dropped, of_sparkplug.dropped) == (6, 1)
         (dropped,) = (one for one in part.figures() if one.name == "multidrop_mqtt_dropped")
@@ -436,7 +436,7 @@ def test_an_infinite_value_is_published_as_null(listener: Listener, start: Start
 def test_without_commands_the_only_command_topic_is_that_of_the_sparkplug_node(tmp_path: Path) -> None:
     require_module("paho.mqtt.client")
     part: Any = build(MqttSettings(sparkplug="works", node="line"), inside(tmp_path))
-    assert [speaker.topics() for speaker in part._speakers] == [
+    assert [messages.topics() for messages in part._formats] == [
         # for finding retained topics of removed drives
         [("multidrop/gateway", 0), ("multidrop/+/available", 0)],
         [("spBv1.0/works/NCMD/line", 1)],
@@ -458,9 +458,9 @@ async def test_commands_are_ignored_unless_enabled(tmp_path: Path, is_retained: 
         ("multidrop", b"stop"),
         ("elsewhere", b""),
     ):
-        part._speakers[0].received(topic, payload, is_retained=is_retained)
+        part._formats[0].received(topic, payload, is_retained=is_retained)
     for topic in ("spBv1.0/works/DCMD/line/pump-1", "spBv1.0", "multidrop/stop"):
-        part._speakers[1].received(topic, b"Device Control/Stop", is_retained=is_retained)
+        part._formats[1].received(topic, b"Device Control/Stop", is_retained=is_retained)
     await asyncio.sleep(0)
     assert known.commands.noted == []
 

@@ -38,7 +38,7 @@ NOT_FINITE = "not a finite number"  # status of a row whose value JSON and Influ
 REMOVED_S = 0.01  # pause in s if the spool is full and has just removed the next message
 # limit of gaps. A gap is a range of messages that were skipped in order to send a newer message first.
 MOST_GAPS = 64
-MOST_REFUSALS = 1000  # limit of remembered refusals; the oldest are forgotten
+MOST_REFUSALS = 1000  # limit of stored refusals, one per refused message; the oldest is deleted
 SET_BACK = (
     "the receiver has message {} of the spool {}, which ends at message {}: the folder was copied or set "
     "back; move it away to start a new spool"
@@ -190,7 +190,7 @@ class RowForwarder(RetryingSender):
         self._position = SpoolPosition(max(0, state.oldest - 1))
         self._is_asked = False
         self._accepted = 0  # messages sent since the gateway's start
-        # by message number: the value of `_accepted` when the message was refused first
+        # by message number: how many messages had been sent when the receiver first refused this one
         self._refusals: dict[int, int] = {}
         spool.acknowledge(self._position.newest)
         spool.on_message = self.announce

@@ -201,7 +201,7 @@ class Turns:
         self._is_taken = False
         while not self._is_taken and (waiting := self.stops or self.others):
             turn = waiting.popleft()
-            if not turn.done():  # the waiting request was cancelled
+            if not turn.done():  # a cancelled request is done already, and takes no turn
                 turn.set_result(None)
                 self._is_taken = True
                 asyncio.get_running_loop().call_soon(self._give)

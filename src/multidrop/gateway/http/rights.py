@@ -177,7 +177,7 @@ class May(NamedTuple):
     verbs: frozenset[str] = frozenset()
 
     def bounded_by(self, other: May) -> May:
-        """Return this table with the smaller of the two tables' rights for callers without a token."""
+        """Return this table, with at most the rights of `other` for callers without a token."""
         look = "anyone" if self.look == other.look == "anyone" else "token"
         return self._replace(look=look, on_loopback=min(self.on_loopback, other.on_loopback))
 
@@ -189,9 +189,9 @@ class May(NamedTuple):
 
 
 def caller_with(token: Token | None, free: Right | None, way: str, address: str) -> Caller | None:
-    """Return a caller with the right of its token, or with `free`, the right without a token, if larger.
+    """Return a caller with the larger of two rights; None if it has neither.
 
-    Return None if the caller has neither right.
+    The first is the right of its token. The second is `free`, the right of all callers without a token.
     """
     if token is not None and (free is None or token.right >= free):
         return Caller(token.name, way, address, token.right)

@@ -395,8 +395,8 @@ class Pages(PageFiles):
     async def token(self, request: Request) -> Response:
         """Log in: store the request's token in a cookie that scripts cannot read.
 
-        After several wrong tokens, an address must wait before its next attempt. If the body says that the
-        token is for a stop, it need not wait.
+        After several wrong tokens, an address must wait before its next attempt. A request whose body says
+        that the token is for a stop is answered at once.
         """
         gateway, caller = self._gateway, caller_of(request)
         body = await body_of(request)

@@ -14,12 +14,12 @@ Schema = Mapping[str, Any]
 
 
 def record(texts: str = "", /, **fields: Schema) -> Schema:
-    """Return the schema of an object with these required keys; `texts` has the keys of strings."""
+    """Return the schema of an object whose keys are required. `texts` names the keys with string values."""
     return {**some(texts, **fields), "required": [*texts.split(), *fields]}
 
 
 def some(texts: str = "", /, **fields: Schema) -> Schema:
-    """Return the schema of an object with these optional keys; `texts` has the keys of strings."""
+    """Return the schema of an object whose keys are optional. `texts` names the keys with string values."""
     return {"type": "object", "properties": dict.fromkeys(texts.split(), TEXT) | fields}
 
 

@@ -102,7 +102,7 @@ class Alarms:
         self._lasting: dict[tuple[str, str, str], Alarm] = {}
         self._ended: deque[Alarm] = deque(maxlen=MOST_ENDED)
         self._known: set[tuple[str, str]] = set()  # lines and drives whose state was seen before
-        # by drive: the argument `stops` of `look` when the motor was first seen running
+        # by drive: how many commands that end a run had been sent when the motor was first seen running
         self._runs: dict[str, int] = {}
         self._stands: dict[str, int] = {}  # by drive: when its motor was first seen at rest after running
         self.begun = 0  # number of alarms that started so far
@@ -173,10 +173,7 @@ class Alarms:
             self._end(time, "", drive, LIMIT)
 
     def note_there(self, line: str) -> None:
-        """Note that a line works.
-
-        If its port is lost later, the start of that alarm is then known exactly.
-        """
+        """Note that a line works: if its port is lost later, the alarm's start time is exact."""
         self._known.add((line, ""))
 
     def forget(self, name: str, time: int) -> None:

@@ -74,9 +74,9 @@ def frame_of(
 
 
 def _drive(hub: Hub, name: str, time_ns: int) -> dict[str, Any]:
-    """Return a drive's entry in the frame.
+    """Return a drive's entry in a message to the page.
 
-    A fresh value is a pair: the value, and its age as an index into the list `ages_ms` of the frame.
+    A fresh value is a pair: the value, and the index of its age in the message's list `ages_ms`.
     """
     shown = hub.seen(name)
     answer = hub.last_answer(name)
@@ -108,7 +108,7 @@ def _age_ms(now: Times, asked: Times) -> int:
 
 
 class TimeNumbers(dict[Times, int]):
-    """Gives each distinct request time in a frame a number, from 0, because many values share one time."""
+    """Numbers the request times of values from 0. Values that were requested together share a number."""
 
     def __missing__(self, time: Times) -> int:
         self[time] = number = len(self)
@@ -179,7 +179,7 @@ class Frames:
         self._clock = clock
         self._begin = begin
         self._remembered: deque[dict[str, Any]] = deque(maxlen=REMEMBERED)  # newest frames, the newest last
-        # encodings of the newest frame by the number of the frame that the viewer has, or by WHOLE
+        # the newest message to the page, encoded for viewers that have message N, by N; WHOLE: have none
         self._encoded: dict[int, Encoded] = {}
         self._due = 0.0
         self._timer: asyncio.TimerHandle | None = None
@@ -292,7 +292,7 @@ class SeenFrames:
         self.clock = clock
         self._commands = commands
         self._made: dict[int, int] = {}  # by frame number: when the frame was made (ns)
-        # by frame number: the admitted commands whose senders had seen this frame
+        # by number of a message to the page: commands that were admitted from senders with this message
         self._came: dict[int, set[object]] = {}
 
     def note(self, n: int) -> None:
@@ -304,12 +304,12 @@ class SeenFrames:
             self._came.pop(old, None)
 
     def admit(self, drive: str, what: str, command: object, seen: int) -> int:
-        """Admit a command whose sender has seen frame `seen`.
+        """Admit a command. `seen` is the number of the newest message that its sender's page has received.
 
         Return the time in ns until which the command may be sent.
 
-        Raises WriteForbidden if the command is too late or repeats another, or if a stop of the drive or a
-        reload followed the frame.
+        Raises WriteForbidden in these cases: the message is too old, the command repeats another, or the
+        message was made before a reload or before a stop of the drive.
         """
         made_ns = self._made.get(seen)
         until_ns = 0 if made_ns is None else made_ns + MOST_AGE_NS

@@ -180,7 +180,8 @@ class Hub:
         self.taken = 0  # number of batches received
         self.unopened: dict[str, str] = {}  # by line: why its port could not be opened
         self.stalled: dict[str, str] = {}  # by line: why its open port accepts no bytes
-        # by drive and register code of a batch, combined into one number; None: not in the plant
+        # rows of a register; key: one number made of a batch's drive code and register code;
+        # None: the register is not in the plant
         self._cells: dict[int, RegisterRows | None] = {}
         self._statuses: tuple[str, ...] = ("ok",)
         self._watched: dict[str, _WatchedDrive] = {}

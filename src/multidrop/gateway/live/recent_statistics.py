@@ -9,8 +9,8 @@ from typing import Any
 from multidrop import Plant
 from multidrop.transport import LineStatistics, Statistics
 
-# in s: time over which a line's use is averaged, and interval of refreshing the figures of the last minute
-SECONDS = 5.0
+USE_S = 5.0  # time, in s, over which a line's use is averaged
+REFRESH_S = 5.0  # interval, in s, of computing the statistics of the last minute
 MINUTE_S, MINUTES = 60.0, 60
 
 Reading = Mapping[str, LineStatistics]
@@ -44,10 +44,10 @@ class RecentStatistics:
         self._refresh()
 
     def tick(self, now: float, utc_ms: int, reading: Reading) -> None:
-        """Add a reading of the poller's counters; `now` is monotonic time in s, which is never set."""
+        """Add a reading of the poller's counters at the monotonic time `now`, in s."""
         self.newest = reading
         self._recent.append((now, reading))
-        while now - self._recent[0][0] > SECONDS:
+        while now - self._recent[0][0] > USE_S:
             self._recent.popleft()
         if not self._minutes or now - self._minutes[-1][0] >= MINUTE_S:
             for line in reading:
@@ -55,7 +55,7 @@ class RecentStatistics:
             self._minutes.append((now, utc_ms, reading))
         is_complete = reading.keys() == self._minute.keys() and None not in self._minute.values()
         if now >= self._due or not is_complete:
-            self._due = now + SECONDS
+            self._due = now + REFRESH_S
             self._refresh()
         self._figures = {line: self._line_figures(line, minute) for line, minute in self._minute.items()}
 
@@ -86,7 +86,7 @@ class RecentStatistics:
         }
 
     def _use(self, name: str) -> tuple[float | None, float | None]:
-        """Return the used share of a line's time and its exchanges per second, over SECONDS."""
+        """Return the used share of a line's time and its exchanges per second, over USE_S."""
         before = self._recent[0][1].get(name) if self._recent else None
         now = self.newest.get(name)
         if before is None or now is None or before is now or before.epoch != now.epoch:

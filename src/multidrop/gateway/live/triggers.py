@@ -145,12 +145,12 @@ class _Conditions:
             series
             for text, signals in found.signals.items()
             for series in signals
-            # other registers of a condition are only listed in its trigger, and are not needed here
+            # the trigger of a fault lists all polled registers of its drive, but is computed from one
             if text in conditions.values() or series[1] == FAULT
         }
         self._inputs = {series: slot for series, slot in self._channels.inputs.items() if series in needed}
         self._by_slot = {slot: name for name, slot in self._channels.slots.items()}
-        # by drive and register code: the index of an input of the conditions
+        # by a batch's drive code and register code: the index of this register among the conditions' inputs
         self._slots: dict[tuple[int, int], int] = {}
         self._sizes = (0, 0)  # how many drive names and register names the newest batch has
         self._was: dict[int, bool] = {}  # whether each condition, by its index, was true before
@@ -188,10 +188,10 @@ class _Conditions:
 def _with_triggers_only(
     drive: DriveSeries, triggers: Container[TriggerSeries], holds_s: Mapping[TriggerSeries, float]
 ) -> DriveSeries:
-    """Return a drive's series in which only triggers are computed; its other channels become inputs.
+    """Return a drive's series that computes only triggers. The drive's other channels become inputs.
 
-    The inputs' values come from polled rows. Totals in rows continue after a restart, but totals computed
-    here would not.
+    The values of these inputs come from the poller's rows. There, a total continues after a restart; a total
+    computed here would start again.
     """
     own = [channel for channel in drive.channels if (drive.name, channel.name) not in triggers]
     inputs = {channel.name: (channel.unit, holds_s[drive.name, channel.name]) for channel in own}

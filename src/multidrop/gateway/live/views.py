@@ -258,7 +258,7 @@ def parts_of(gateway: Gateway) -> dict[str, str]:
 
 
 def failing_lines_of(gateway: Gateway) -> dict[str, str]:
-    """Return by line why its polling fails with an exception, which a user's drive class may raise."""
+    """Return why polling fails, by line. For example, a user's drive class may raise an exception."""
     failures = {} if gateway.poller is None else gateway.poller.line_failures
     return {line: f"polling fails: {why}" for line, why in failures.items()}
 

@@ -49,14 +49,14 @@ class AddressRow(NamedTuple):
     offset: float = 0
     scale_address: int | None = None
     unit: str = ""
-    unknown: str = NO_ANSWER  # answer to a read without a current value
+    unknown: str = NO_ANSWER  # answer to a read while the value is unknown
     # origin of the value: "gateway": computed; "polled": polled from the drive; "drive": read on request
     source: str = "gateway"
     note: str = ""
 
 
-# A function that returns a row of one drive. Its arguments are the value's name, and the row's columns from
-# `access` on.
+# A function that makes an AddressRow of one drive. Its arguments are the value's name, and the row's fields
+# from `access` on.
 MakeRow = Callable[..., AddressRow]
 
 

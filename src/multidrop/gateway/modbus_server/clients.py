@@ -90,7 +90,7 @@ class ModbusClient(asyncio.Protocol):
         self._port.share.note(self, is_busy=False)
         self._port.forget(self)
         for task in self._under_way:
-            # soon: a task that is cancelled before it has started does not cancel the request it awaits
+            # Give a new task time to start. Without a start it would not cancel the request that it awaits.
             asyncio.get_running_loop().call_soon(task.cancel)
 
     def data_received(self, data: bytes) -> None:

@@ -189,7 +189,7 @@ class Standstill:
     def admit(self, what: str) -> float:
         """Return the deadline for sending a write that is received now (CLOCK_BOOTTIME, ns).
 
-        Raises WriteForbidden after a standstill of the gateway.
+        Raises WriteForbidden if the gateway did not run a moment ago: the write may have waited since then.
         """
         self.note()
         if self._ran_ns < self._until_ns:
@@ -211,8 +211,8 @@ class WritingClient(Protocol):
 class ClientWrites:
     """Carries out the writes of clients that share a role and an interface, such as "modbus".
 
-    `common` has the addresses of the common block, or is None without such a block. Writes are refused
-    after the `standstill` has detected that the gateway did not run.
+    `common` has the addresses of the registers that every drive has in the same form, or is None without such
+    registers. `standstill` refuses writes that may have waited while the gateway did not run.
     """
 
     def __init__(

@@ -119,7 +119,7 @@ class ModbusServer:
     def serve(self, port: str, request: MbapRequest, client: ModbusClient) -> Answer:
         """Return the answer to a request, or an awaitable of it.
 
-        None, for a broadcast, closes the connection.
+        Return None for a broadcast, which has no answer. The caller then closes the connection.
         """
         if request.unit == 0:
             return None

@@ -186,7 +186,7 @@ class Unit:
         self.common = CommonBlock(polled)
         self.channels = ChannelBlock(polled)
         self.stops = frozenset(_stop_writes(polled.drive))
-        # readable addresses by the function code that reads them; 0: those that no function reads
+        # by Modbus function code: the addresses that it reads; 0: registers that no standard function reads
         self._readable: dict[int, set[int]] = {code: set() for code in range(5)}
         self._gaps: list[tuple[int, range]] = []
         self._writable: dict[tuple[Carrier, int], Register[Any]] = {}
@@ -220,7 +220,7 @@ class Unit:
         return self._writable.get((carrier, address))
 
     def has_stop_in(self, written: WriteRequest, common_stop: int | None) -> bool:
-        """Return True if a request writes a value that stops the motor, or any but 0 to `common_stop`."""
+        """Return True if a request stops the motor. Any number except 0 at `common_stop` is a stop."""
         carrier, start, size, data = written
         for at in range(size):
             if carrier is Carrier.WORD and start + at == common_stop and data[2 * at : 2 * at + 2] != b"\0\0":

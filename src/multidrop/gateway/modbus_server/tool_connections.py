@@ -24,7 +24,7 @@ _MBAP = 6  # number of bytes before the unit id in a Modbus TCP frame
 
 
 class End(Protocol):
-    """The gateway's side of a tool's connection."""
+    """The gateway's side of a connection to a vendor's PC tool."""
 
     @property
     def address(self) -> str:

@@ -86,11 +86,11 @@ class ToolSettings:
 
     # Path of the symbolic link to a line's pseudo-terminal, by line.
     pty: Mapping[str, str] = field(default_factory=dict, metadata={"additionalProperties": _TEXT})
-    # Host and port of a line's RTU over TCP, by line.
+    # Host and port where the gateway accepts RTU over TCP for a line, by line.
     rtu: Mapping[str, str] = field(
         default_factory=dict, metadata={"additionalProperties": {**_TEXT, **ADDRESS}}
     )
-    # The role of all tools.
+    # The role of all connected PC tools: "look", "stop" or "write".
     may: str = field(default="look", metadata={"enum": [*ROLES]})
     # Addresses and networks that may connect to `rtu`; empty: only this computer.
     clients: Sequence[str] = field(default=(), metadata={"items": {"type": "string", "pattern": NETWORK}})
@@ -167,7 +167,7 @@ class Tool:
     seconds after its request is dropped, because the tool could take it for the reply to its next request.
     """
 
-    is_full = False  # the number of writes is limited for the line, not for a single tool
+    is_full = False  # a single tool has no limit of concurrent writes; its line has one
 
     def __init__(self, end: End, serve: Serve, timeout: float) -> None:
         self.address = end.address
@@ -218,9 +218,9 @@ class Tool:
                 _log.exception("a request of tool %s failed", self.address)
 
     def _drop_rest(self) -> None:
-        """Drop an incomplete request, unless the rest of it has arrived while the event loop was busy.
+        """Drop an incomplete request, but first read bytes that arrived while the event loop was busy.
 
-        Requests in the bytes after it are served, because a stop may be among them.
+        If these bytes do not complete it, serve any complete requests after it: one may be a stop.
         """
         self._rest = None
         if self._take_in() and self._rest is None:
@@ -244,7 +244,7 @@ class Tool:
 
     def _give_up(self) -> None:
         if self._answering is not None and not self._answering.done():
-            # soon: a task that is cancelled before it has started does not cancel the request it awaits
+            # Give a new task time to start. Without a start it would not cancel the request that it awaits.
             self._loop.call_soon(self._answering.cancel)
         self._answering = None
 
@@ -274,7 +274,7 @@ class Tool:
 
 
 class ToolLine:
-    """The drives of one line by address, as the line's tools see them."""
+    """Serves the requests of the PC tools that are connected to one line. They address its drives."""
 
     def __init__(
         self,
@@ -296,7 +296,7 @@ class ToolLine:
         self._writes = ClientWrites(commands, role, WAY, None, standstill)
 
     def serve(self, request: MbapRequest, tool: Tool) -> Awaitable[bytes | None] | None:
-        """Start a request; return an awaitable of the answer's frame, or None if it gets no answer."""
+        """Start a request. Return an awaitable of its reply, or None if the request gets no reply."""
         unit, is_write = self._units.get(request.unit), request.function in WRITES
         if request.unit == 0 and is_write:
             self._writes.note_refused(self._name, "all", request, "a broadcast is never passed on", tool)
@@ -333,7 +333,7 @@ class ToolLine:
     async def _passed(
         self, unit: Unit, request: MbapRequest, start: int, count: int, tool: Tool
     ) -> bytes | None:
-        """Read from the drive once the line has time for tools.
+        """Read from the drive as soon as the line's bus time for PC tools allows it.
 
         Answer "busy" if the read has not started within WAIT_SHARE of the timeout.
         """

@@ -33,7 +33,7 @@ _OPEN = frozenset({NumberFormat.I8, NumberFormat.U32_EITHER})
 MOST_KNOWN = 8192  # limit of the cached values; all drives of a family share the cache
 _MOST_EXACT = 1 << 53  # a float64 represents every whole number up to this one
 _FUNCTIONS = {Carrier.BIT: (1, 2), Carrier.WORD: (3, 4)}
-COMMON_LENGTH = 16  # length of the common block in words
+COMMON_LENGTH = 16  # number of words in the common block, which is the same for every drive
 # offsets in the common block, in words
 STATE, FAULT, FREQUENCY, CURRENT, SETPOINT, AGE, STOP = 0, 1, 2, 4, 6, 8, 10
 STATES = {"unknown": 0, "stands": 1, "runs": 2, "fault": 3, "silent": 4}
@@ -202,7 +202,7 @@ class DriveWords:
 def _newest_word(
     found: list[tuple[Newest | None, _PolledRegister, int]], now_ns: int, since_ns: int
 ) -> int | Unavailable:
-    """Return the word at an address that several registers share, from the register that was read last."""
+    """Return the word at an address that belongs to several registers. The newest read decides."""
     reason = Unavailable.STALE
     for row, polled, at in sorted(found, key=lambda one: -one[0].monotonic_ns if one[0] else 0):
         word = polled.word(row, at, now_ns, since_ns)
@@ -246,7 +246,7 @@ NUMBERS = (
 
 
 class CommonBlock:
-    """The common block of one drive. Its words are computed on request."""
+    """A drive's state and main values, at the same addresses for every drive. Computed on request."""
 
     length = COMMON_LENGTH
 
@@ -325,7 +325,10 @@ def _float(value: float) -> bytes:
 
 
 def _units(register: Register[Any]) -> tuple[str | None, ...]:
-    """Return the units in which the register may be requested; None means any unit, except for raw counts."""
+    """Return the units in which callers may ask for this register. None stands for "any unit".
+
+    A register of unknown scale is returned only to callers that ask for raw counts.
+    """
     is_raw = register.values is None and register.step is None
     return (register.value_unit,) if is_raw else (register.value_unit, None)
 

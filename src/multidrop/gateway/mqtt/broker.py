@@ -25,7 +25,7 @@ RETRY_S = (1, 30)  # in s: the first and the longest pause before reconnecting
 KEEP_ALIVE_S = 15
 FAREWELL_S = 1.0  # time limit, in s, for sending the last messages before a disconnect
 CONFIRM_S = 10.0  # time limit, in s, for the broker's confirmation of messages
-CONFIRMED = "multidrop/confirmed"  # `confirm` unsubscribes from this topic, which has no subscription
+CONFIRMED = "multidrop/confirmed"  # topic without a subscription; see `confirm`
 _log = logging.getLogger("multidrop.gateway.mqtt.part")
 
 
@@ -149,8 +149,8 @@ def make_client(address: Address, login: Login, name: str) -> Any:
     return client
 
 
-class Speaker(Protocol):
-    """The messages that one connection sends and handles, in one format, such as JsonTopics.
+class Messages(Protocol):
+    """Makes the messages of one connection and handles received ones: JsonTopics or SparkplugNode.
 
     The methods run in the event loop.
     """
@@ -175,16 +175,16 @@ class Speaker(Protocol):
 
 
 class Broker:
-    """A connection to a broker, over which a `Speaker` publishes messages.
+    """A connection to a broker, over which `Messages` are sent and received.
 
     A thread of the library paho sends them. Only `close` waits for that thread.
     """
 
-    def __init__(self, address: Address, login: Login, name: str, speaker: Speaker) -> None:
+    def __init__(self, address: Address, login: Login, name: str, messages: Messages) -> None:
         self._address = address
         self._name = name
         self._thread: threading.Thread | None = None  # paho's thread for this connection
-        self._speaker = speaker
+        self._messages = messages
         self.loop: asyncio.AbstractEventLoop | None = None
         self.outbox = Outbox(self._send)
         self.is_connected = False
@@ -231,35 +231,34 @@ class Broker:
         self._client = None  # frees the sockets that paho uses to wake its thread
 
     def publish(self) -> None:
-        """Let the speaker publish its new values.
+        """Publish new values.
 
-        Without a connection, the newest message of each topic waits. Raises RuntimeError if paho's thread has
-        ended.
+        Without a connection, the outbox keeps the newest message of each topic. Raises RuntimeError if paho's
+        thread has ended.
         """
         if self._thread is not None and not self._thread.is_alive():
             raise RuntimeError("the thread of the broker's connection has ended")
         had_failed = self.failure
-        self._let(self._speaker.publish)
+        self._publish_by(self._messages.publish)
         if had_failed and not self.failure and self.is_connected:
             self.publish_all()
 
     def publish_all(self) -> None:
         """Publish all current messages again, as after a new connection."""
-        self._let(self._speaker.connected)
+        self._publish_by(self._messages.connected)
 
-    def _let(self, say: Callable[[], None]) -> None:
-        """Call a method of the speaker that publishes messages.
+    def _publish_by(self, publish: Callable[[], None]) -> None:
+        """Call `publish`. If it fails, publish "offline", but keep receiving commands.
 
-        If it fails, publish "offline", but keep receiving commands. Without "offline", the values that the
-        broker retains would look current.
+        Without "offline", the values that the broker retains would look current.
         """
         try:
-            say()
+            publish()
         except Exception as failure:
             if not self.failure:
                 _log.exception("publishing fails")
                 if self.is_connected:
-                    self._speaker.leave()
+                    self._messages.leave()
             self.failure = f"publishing fails: {type(failure).__name__}: {failure}"
         else:
             self.failure = ""
@@ -300,7 +299,7 @@ class Broker:
         return int(sent.mid) if sent.rc == 0 else None
 
     def _set_will(self) -> None:
-        will = self._speaker.will()
+        will = self._messages.will()
         self._client.will_set(will.topic, will.make(), will.qos, will.is_retained)
 
     # ---- in the loop ----
@@ -310,7 +309,7 @@ class Broker:
         self._connections += 1
         self._why = ""
         _log.info("connected to %s:%d", self._address.host, self._address.port)
-        for topic, qos in self._speaker.topics():
+        for topic, qos in self._messages.topics():
             self._client.subscribe(topic, qos)
         self.failure = ""  # a failure of the previous connection does not matter now
         self.outbox.forget()  # drop old messages: in Sparkplug, the first message must be a birth
@@ -356,7 +355,7 @@ class Broker:
             self._call(self._acknowledge)
 
     def _on_message(self, _client: Any, _data: Any, message: Any) -> None:
-        received = self._speaker.received
+        received = self._messages.received
 
         def take() -> None:
             self._handled.release()

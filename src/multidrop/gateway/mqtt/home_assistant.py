@@ -167,7 +167,7 @@ def _total(register: Register[Any]) -> str:
 
 
 def _written(name: str, register: Register[Any], topic: str) -> dict[str, Any]:
-    """Return the component that writes a register: a choice between names, or a number with its range."""
+    """Return the Home Assistant component that writes a register: a list of names, or a number in a range."""
     found: dict[str, Any] = {
         "unique_id": f"{name}-{register.name}-set",
         "name": f"{register.name.replace('_', ' ')} (set)",
@@ -188,7 +188,7 @@ def _written(name: str, register: Register[Any], topic: str) -> dict[str, Any]:
 
 
 def _choices(register: Register[Any]) -> dict[str, int]:
-    """Return the raw counts that the register names, by name; empty for numbers and bits."""
+    """Return the raw count of each named value of the register; empty for numbers and bits."""
     if register.values is None or issubclass(register.values, Flag):
         return {}
     return {member.name: member.value for member in register.values}

@@ -139,7 +139,7 @@ class JsonTopics:
     def _retained(topic: str, payload: bytes) -> Publication:
         return Publication(topic, lambda: payload, is_retained=True)
 
-    # ---- the methods of Speaker ----
+    # ---- the methods of Messages ----
 
     def will(self) -> Publication:
         return self._retained(self._topic("gateway"), OFFLINE)

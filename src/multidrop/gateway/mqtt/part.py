@@ -27,10 +27,10 @@ Settings = MqttSettings
 def build(settings: MqttSettings, context: PartContext) -> Mqtt:
     """Return the MQTT interface. Raises ImportError without the library paho."""
     topics = JsonTopics(settings, context, utc_ms)
-    speakers: list[Any] = [topics]
+    formats: list[Any] = [topics]
     if settings.sparkplug:
-        speakers.append(SparkplugNode(settings, context, utc_ms))
-    part = Mqtt(settings, context, topics, speakers)
+        formats.append(SparkplugNode(settings, context, utc_ms))
+    part = Mqtt(settings, context, topics, formats)
     if settings.rows:
         part.forward_rows(settings, context)
     return part
@@ -39,23 +39,23 @@ def build(settings: MqttSettings, context: PartContext) -> Mqtt:
 class Mqtt:
     """The gateway's MQTT interface.
 
-    Each message format (`Speaker`) has its own connection, because a connection can have only one last will.
+    Each message format (`Messages`) has its own connection, because a connection can have only one last will.
     """
 
     def __init__(
-        self, settings: MqttSettings, context: PartContext, topics: JsonTopics, speakers: list[Any]
+        self, settings: MqttSettings, context: PartContext, topics: JsonTopics, formats: list[Any]
     ) -> None:
         address, login = parse_broker(settings.broker), settings.login(context.plant)
         self._every = settings.every_s
         self._topics = topics
-        self._speakers = speakers
+        self._formats = formats
         self._brokers = []
         self._forwarded: list[Forwarding] = []
-        for speaker in speakers:
+        for messages in formats:
             # the client id, which must differ from that of every other gateway at the broker
-            name = f"{settings.prefix}/{context.plant.path.stem}/{speaker.kind}"
-            broker = Broker(address, login, name, speaker)
-            speaker.outbox = broker.outbox
+            name = f"{settings.prefix}/{context.plant.path.stem}/{messages.kind}"
+            broker = Broker(address, login, name, messages)
+            messages.outbox = broker.outbox
             self._brokers.append(broker)
 
     def forward_rows(self, settings: MqttSettings, context: PartContext) -> None:
@@ -68,7 +68,7 @@ class Mqtt:
         address, login = parse_broker(settings.broker), settings.login(context.plant)
         self._forwarded.append(json_rows(settings, context, address, login))
         try:
-            for broker, node in zip(self._brokers[1:], self._speakers[1:], strict=True):
+            for broker, node in zip(self._brokers[1:], self._formats[1:], strict=True):
                 self._forwarded.append(sparkplug_rows(settings, context, broker, node))
         except BaseException:
             for one in self._forwarded:
@@ -86,8 +86,8 @@ class Mqtt:
 
     def adopt(self, plant: Plant) -> None:
         """Use another plant, and announce all its drives."""
-        for broker, speaker in zip(self._brokers, self._speakers, strict=True):
-            speaker.adopt(plant)
+        for broker, messages in zip(self._brokers, self._formats, strict=True):
+            messages.adopt(plant)
             if broker.is_connected:
                 broker.publish_all()
         for one in self._forwarded:
@@ -118,9 +118,9 @@ class Mqtt:
                 raise failure
 
     async def _leave(self) -> None:
-        for broker, speaker in zip(self._brokers, self._speakers, strict=True):
+        for broker, messages in zip(self._brokers, self._formats, strict=True):
             if broker.is_connected:
-                speaker.leave()
+                messages.leave()
             await broker.close()
 
     def health(self) -> str:

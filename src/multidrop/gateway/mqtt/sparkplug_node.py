@@ -69,7 +69,7 @@ class SparkplugNode:
     def _topic(self, kind: str, *device: str) -> str:
         return "/".join((NAMESPACE, self._settings.sparkplug, kind, self._node, *device))
 
-    # ---- the methods of Speaker ----
+    # ---- the methods of Messages ----
 
     def will(self) -> Publication:
         self._birth = (self._birth + 1) % SEQUENCES
@@ -105,15 +105,15 @@ class SparkplugNode:
             self._command(levels[-1], given, sent_ms, is_retained=is_retained)
 
     def adopt(self, plant: Plant) -> None:
-        """Use another plant, and send the deaths of drives that it lacks."""
+        """Use another plant, and send a death certificate (DDEATH) for each drive that it lacks."""
         self._plant = plant
         for drive in self._sent.keys() - drives_of(plant).keys():
             self._replace_pending(drive, "DDEATH", self._device_death)
-        self._sent.clear()  # the drives that stay may have other registers: send their births again
+        self._sent.clear()  # send all birth certificates again, because drives may have other registers
         self._changed.clear()
 
     def publish(self) -> None:
-        """Send changed values, and births and deaths of drives."""
+        """Send changed values, and the birth and death certificates of drives."""
         for drive in self._hub.drives:
             if self._hub.state(drive) == SILENT:
                 if self._sent.pop(drive, None) is not None:

@@ -131,7 +131,7 @@ class OpcUa:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._serving: asyncio.Future[None] | None = None  # done when the server's thread has ended
         self._opened: tuple[asyncio.AbstractEventLoop, asyncio.Event, PlantNodes] | None = None
-        self._is_over = False  # True: end the server; if it is still starting, once it has started
+        self._is_over = False  # True: the server ends; one that is still starting ends after its start
         # pending while the server takes over a new plant or new values
         self._writing: Future[None] | None = None
 
@@ -244,10 +244,10 @@ class OpcUa:
 
     @contextmanager
     def _quick_process(self) -> Iterator[None]:
-        """Make threads take turns quickly while a server runs.
+        """Shorten the time slices of threads while a server runs. Undo this after the last server.
 
-        After the last server has ended, objects excluded by `lasting` are collected again. There may be two
-        servers: during a reload, a new server may start before the old one has ended.
+        Then also let the garbage collector examine again the objects that `lasting` excluded. During a reload
+        there may be two servers: a new one may start before the old one has ended.
         """
         _unended.add(self)
         sys.setswitchinterval(SWITCH_S)

@@ -91,7 +91,7 @@ class Visitor(User):
 
 
 HasRight = Callable[[Visitor, Right], bool]  # a function that returns whether the user has a right
-# a function that calls a method, which is always a stop
+# a function that handles the call of an OPC UA method; all methods of this server are stops
 Stop = Callable[[ua.CallMethodRequest, Visitor], Awaitable[ua.CallMethodResult]]
 
 
@@ -321,7 +321,7 @@ def read_identity(certificate: Path, key: Path) -> Identity:
 class PlantServer(Server):
     """The OPC UA server.
 
-    `may` returns whether a user has a right, and `stop` calls a method, which is a stop.
+    `may` returns whether a user has a right. `stop` handles method calls; all methods are stops.
     """
 
     def __init__(self, listener: socket.socket, may: HasRight, stop: Stop) -> None:
