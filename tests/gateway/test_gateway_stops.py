@@ -242,7 +242,7 @@ def test_a_stop_works_while_values_cannot_be_shown(gateway: Served, monkeypatch:
         name, method = broken.split(".")
         monkeypatch.setattr(getattr(gateway.gateway, name), method, fail)
     until(lambda: gateway.gateway.failures.get("hub", 0) > 3)
-    gateway.gateway.frames._has_news = True  # without news, no page frame is made
+    gateway.gateway.frames._has_news = True  # without new values, no message to the page is made
     assert gateway.get("/api/frame").status == 500
     assert [one["done"] for one in gateway.post("/api/stop").json.values()] == [True, True]
 

@@ -150,7 +150,9 @@ def test_a_hanging_history_query_is_reported(tmp_path: Path, monkeypatch: pytest
 
 
 @pytest.mark.long
-def test_a_disk_that_hangs_at_history_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_that_hangs_while_history_is_written_is_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     go_on = threading.Event()
     with served(tmp_path, SERVE + HISTORY) as gateway:
         until(lambda: health(gateway)["status"] == "ok")
@@ -279,7 +281,7 @@ def test_hanging_page_files_delay_no_other_request(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(files, "READ_S", SHORT_S)
     with served(tmp_path, SERVE) as gateway:
         monkeypatch.setattr(Path, "read_bytes", read_bytes)
-        # more requests than the four reads of files that may hang at once
+        # five requests, because at most four reads of files may hang at once
         for path in ("/", "/page/app.js", "/", "/page/app.js", "/page/boot.js"):
             answer = gateway.get(path)
             assert (answer.status, answer.json["error"][:11]) == (503, "page files:")
@@ -384,7 +386,7 @@ def dropped(gateway: Served) -> float:
 
 
 @pytest.mark.long
-def test_a_full_disk_is_reported_while_polling_and_stops_continue(disk: Path, tmp_path: Path) -> None:
+def test_a_full_disk_interrupts_neither_polling_nor_a_stop(disk: Path, tmp_path: Path) -> None:
     with served(tmp_path, ON_DISK) as gateway:
         gateway.await_state("pump-2", "stands")
         history = gateway.gateway.feeds["history"]

@@ -91,7 +91,7 @@ def test_each_start_and_end_of_a_thousand_alarms_is_sent_as_one_message() -> Non
     ]
 
 
-def test_acknowledgements_changed_texts_and_other_kinds_of_alarms_are_not_sent() -> None:
+def test_only_the_start_and_the_end_of_an_alarm_are_sent() -> None:
     target = Clocked()
     alarms = Alarms(note=Notifications([target.sender], [PORT]).note_alarm)
     alarms.look(1_000, "pump", Shown(FAULT, "overcurrent"))
@@ -294,7 +294,7 @@ def test_waiting_for_an_answer_that_arrives_byte_by_byte_has_a_limit(monkeypatch
         ("# https://hooks.example/T0K3N", "has no target"),
     ],
 )
-def test_an_invalid_target_is_refused_without_its_secret(tmp_path: Path, line: str, sentence: str) -> None:
+def test_the_error_about_an_invalid_target_hides_its_secret(tmp_path: Path, line: str, sentence: str) -> None:
     (tmp_path / "targets").write_text(f"{line}\n")
     found, [mistake] = read_targets(tmp_path / "targets")
     assert (found, sentence in mistake, "T0K3N" in mistake) == ([], True, False)

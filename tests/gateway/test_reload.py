@@ -191,7 +191,7 @@ def test_a_port_that_is_missing_after_a_reload_is_reported(tmp_path: Path) -> No
         until(lambda: gateway.frame()["lines"]["roof"]["lost"] is None)
 
 
-def test_rights_names_and_tokens_are_reloaded_and_other_settings_need_a_restart(tmp_path: Path) -> None:
+def test_a_reload_applies_the_rights_and_host_names_of_serve(tmp_path: Path) -> None:
     with served(tmp_path, f'[serve]\nnames = ["old.example"]\nlisten = "localhost:1"\n{MAY}') as gateway:
         gateway.await_state("pump-1", "stands")
         assert gateway.get("/health", host="old.example").status == 200

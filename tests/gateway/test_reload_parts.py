@@ -96,7 +96,9 @@ def test_a_reload_changes_nothing_if_a_gateway_part_cannot_be_opened(gateway: Se
 
 
 @pytest.mark.slow
-def test_a_part_that_fails_cancels_the_reload(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_reload_is_cancelled_if_a_server_of_the_gateway_cannot_start(
+    gateway: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
     first = free_port()
     assert reload(gateway, MODBUS.format(first, 21))["done"] is True
     build, failures = parts_module.build, [MemoryError("no memory")]
@@ -281,7 +283,7 @@ async def test_a_stop_that_fails_while_a_reload_changes_lines_is_sent_again() ->
     assert lines.begun == [FAN, FAN]
 
 
-async def test_a_stop_of_a_drive_that_a_reload_adds_is_sent_once_it_is_attached() -> None:
+async def test_a_drive_that_a_reload_adds_is_stopped_as_soon_as_it_is_attached() -> None:
     """The name may have another Unicode spelling. Drives of the present plant are not stopped."""
     new = InvtCHE(2, name="L\u00fcfter")
     lines = Lines(plant_of(PUMP, FAN), plant_of(new, FAN))

@@ -180,7 +180,7 @@ def test_a_pattern_allows_a_register_only_for_drives_that_have_it(tmp_path: Path
     assert found.write == {"pump-1.setpoint", "pump-2.setpoint"}
 
 
-def test_an_entry_equal_to_the_name_of_a_drive_with_a_star_is_no_pattern(tmp_path: Path) -> None:
+def test_a_drive_name_with_a_star_is_not_read_as_a_pattern(tmp_path: Path) -> None:
     plant = written(tmp_path, '[serve.may]\nverbs = ["p*.start"]\n', "p*", "pump-1")
     assert read_settings(plant, {}).may.verbs == {"p*.start"}
 
@@ -209,7 +209,9 @@ def test_an_entry_equal_to_the_name_of_a_drive_with_a_star_is_no_pattern(tmp_pat
         ('family.invt-che = ["start"]', "family invt-che: ['start'] is not a table with write, verbs"),
     ],
 )
-def test_patterns_and_families_without_a_drive_are_refused(tmp_path: Path, may: str, sentence: str) -> None:
+def test_an_entry_of_serve_may_without_a_matching_drive_is_refused(
+    tmp_path: Path, may: str, sentence: str
+) -> None:
     with pytest.raises(PlantError) as wrong:
         read_settings(written(tmp_path, f"[serve.may]\n{may}\n", *NAMES), {})
     assert any(sentence in mistake for mistake in wrong.value.mistakes), wrong.value.mistakes

@@ -286,7 +286,7 @@ async def test_a_dead_task_that_is_started_again_is_no_longer_reported() -> None
 
 
 @pytest.mark.parametrize("failure", [ValueError("no"), SystemExit("no"), StopIteration("no")])
-async def test_supervisor_within_raises_the_errors_of_the_function_it_runs(failure: BaseException) -> None:
+async def test_the_supervisor_raises_the_errors_of_the_function_it_runs(failure: BaseException) -> None:
     def work() -> None:
         raise failure
 
@@ -311,7 +311,7 @@ async def test_work_that_hangs_raises_hung_and_is_reported_until_later_work_succ
         await asyncio.sleep(0)
 
 
-async def test_supervisor_within_raises_without_a_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_the_supervisor_raises_an_error_if_no_thread_can_start(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(thread: threading.Thread) -> None:
         raise RuntimeError("can't start new thread")
 

@@ -172,7 +172,7 @@ def test_a_receiver_gets_all_rows_with_and_without_values(tmp_path: Path, kind: 
 
 
 @pytest.mark.slow
-def test_database_has_the_values_and_units_of_rows_and_the_forwarder_position(tmp_path: Path) -> None:
+def test_postgres_stores_the_rows_and_the_position_of_the_forwarder(tmp_path: Path) -> None:
     """The gateway's database user either may create a schema, or owns one."""
     with postgres() as database:
         database.ask("create role gateway login")

@@ -254,7 +254,9 @@ def test_a_connection_whose_client_reads_no_answers_is_closed(
 
 
 @pytest.mark.long
-async def test_http_stops_of_a_silent_drive_are_joined(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_http_stops_of_a_silent_drive_share_calls(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(web, "HEAD_S", 0.01)
     called, silent = list[list[str]](), asyncio.Event()
 
@@ -276,7 +278,7 @@ async def test_http_stops_of_a_silent_drive_are_joined(monkeypatch: pytest.Monke
     silent.set()
 
 
-async def test_one_request_starts_per_event_loop_cycle_and_stops_start_first() -> None:
+async def test_a_stop_starts_before_the_waiting_reads() -> None:
     order: list[str] = []
 
     async def take(turns: Turns, name: str, waiting: deque[asyncio.Future[None]]) -> None:

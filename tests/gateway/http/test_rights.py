@@ -49,8 +49,8 @@ STOP_VERB = ("/api/act", {"drive": "pump-2", "verb": "stop", "options": {}})
 ACTS = (STOP, WRITE, UNLISTED_WRITE, RESET, UNLISTED_VERB, STOP_VERB)
 
 LOCAL, OTHER = "127.0.0.1", "10.0.0.7"  # client addresses that a proxy reports in X-Forwarded-For
-# Keys: (settings, address of the caller). Values: a list with, for each token (by its right; None: no token),
-# the expected HTTP status of all requests in LOOKS, and the expected status of each request in ACTS.
+# Expected HTTP statuses, by the settings and the caller's address. A row has the right of the caller's token
+# (None: no token), the status of all requests in LOOKS, and the status of each request in ACTS.
 TABLE = {
     (MAY, LOCAL): [
         (None, 200, (401, 401, 401, 401, 401, 401)),
@@ -232,7 +232,7 @@ def test_request_with_two_host_headers_is_refused(open_gateway: Served) -> None:
 
 
 @pytest.mark.parametrize("path", ["/", "/api/plant", "/api/nothing", "/metrics", "/api/stop"])
-def test_answers_forbid_framing_and_guessing_of_their_type(open_gateway: Served, path: str) -> None:
+def test_http_answers_have_the_security_headers(open_gateway: Served, path: str) -> None:
     headers = open_gateway.get(path).headers
     if path == "/":
         policy = "default-src 'self'; base-uri 'none'; form-action 'none'; object-src 'none'"
@@ -451,7 +451,9 @@ def test_verbs_are_refused_over_modbus_even_if_the_settings_list_them() -> None:
     assert {rules[verb] for verb in VERBS} == {NEVER_THIS_WAY}
 
 
-async def test_concurrent_writes_per_line_are_limited_but_not_stops(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_the_limit_of_concurrent_writes_on_a_line_lets_stops_pass(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Each write occupies a thread, so a blocked line could otherwise occupy any number of threads."""
     go_on = threading.Event()
 

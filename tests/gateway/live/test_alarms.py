@@ -66,7 +66,7 @@ def test_a_drive_shows_a_fault_when_its_fault_record_changes(tmp_path: Path) -> 
     take(hub, 10, status=RUNNING, output_frequency=500, last_fault=0)
     assert hub.seen("pump-1").state == "runs"
     take(hub, 11, last_fault=ErmanFault.OVERHEAT | 1 << 8)
-    # although the latest status and frequency still show a running motor
+    # the fault is shown although the older status and frequency belong to a running motor
     assert hub.seen("pump-1") == Shown("fault", "overheat, bit 8")
     take(hub, 12, status=STOPPED, output_frequency=0, last_fault=ErmanFault.OVERHEAT | 1 << 8)
     assert hub.seen("pump-1")[:2] == ("fault", "overheat, bit 8")
@@ -92,13 +92,16 @@ def test_a_reset_ends_a_recorded_fault_and_an_old_record_is_no_fault(tmp_path: P
     assert hub.seen("pump-1").state == "stands"
 
 
-def test_an_unknown_state_has_a_reason_and_a_new_yd1000_fault_record_is_a_fault(tmp_path: Path) -> None:
+def test_a_new_fault_record_of_a_yd1000_is_shown_as_a_fault(tmp_path: Path) -> None:
     hub = hub_of(tmp_path, "yd1000", '["output_frequency", "status", "fault_record_1"]')
     take(hub, 10, output_frequency=0, status=0, fault_record_1=1)
     shown = hub.seen("pump-1")
     assert (shown.state, shown.note) == ("unknown", NOT_AT_REST)
     take(hub, 12, output_frequency=0, fault_record_1=18)
     assert hub.seen("pump-1").fault == "fault record 1: 18"
+
+
+def test_an_unknown_state_has_a_reason(tmp_path: Path) -> None:
     hub = hub_of(tmp_path, "erman-er-g-220", '["status", "output_frequency"]')
     take(hub, 10, output_frequency=0, status=STOPPED)
     assert hub.seen("pump-1") == Shown("unknown", None, "last_fault is not polled")
@@ -269,7 +272,7 @@ def past_of(path: Path) -> list[Alarm]:
     return kept.past or []
 
 
-def test_of_several_lines_about_an_alarm_in_the_alarm_file_the_last_counts(tmp_path: Path) -> None:
+def test_the_last_line_about_an_alarm_in_the_alarm_file_is_used(tmp_path: Path) -> None:
     path = tmp_path / "alarms.jsonl"
     kept = started(path)
     for alarm in (ALARM, ALARM._replace(ended=5), ALARM._replace(time=9)):

@@ -41,7 +41,9 @@ def frames(clock: Clock, made: list[int]) -> Frames:
     return Frames(make, clock)
 
 
-async def test_a_hundred_viewers_share_one_page_frame(frames: Frames, clock: Clock, made: list[int]) -> None:
+async def test_a_hundred_viewers_share_one_message_to_the_page(
+    frames: Frames, clock: Clock, made: list[int]
+) -> None:
     first = await frames.after(-1)
     assert first is not None
     viewers = [asyncio.create_task(frames.after(first.n)) for _ in range(100)]
@@ -57,7 +59,7 @@ async def test_a_hundred_viewers_share_one_page_frame(frames: Frames, clock: Clo
     assert made == [1, 2]
 
 
-async def test_changes_between_two_page_frames_are_computed_once_for_all_viewers(
+async def test_changes_between_two_messages_are_computed_once_for_all_viewers(
     frames: Frames, clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     compared: list[int] = []
@@ -94,7 +96,7 @@ async def test_at_most_five_frames_are_made_per_second(frames: Frames, clock: Cl
 
 
 async def test_rows_too_early_for_a_frame_appear_in_the_next(frames: Frames, clock: Clock) -> None:
-    """The next page frame is made even if no further rows arrive."""
+    """The next message to the page is made even if no further rows arrive."""
     first = await frames.after(-1)
     assert first is not None
     frames.note_news()
@@ -107,14 +109,16 @@ async def test_rows_too_early_for_a_frame_appear_in_the_next(frames: Frames, clo
     assert second.n == 2
 
 
-def test_no_page_frame_is_made_without_viewers(frames: Frames, clock: Clock, made: list[int]) -> None:
+def test_no_message_to_the_page_is_made_without_viewers(
+    frames: Frames, clock: Clock, made: list[int]
+) -> None:
     for _ in range(100):
         clock.now += 1.0
         frames.note_news()
     assert made == []
 
 
-async def test_a_viewer_that_was_away_gets_the_newest_page_frame(frames: Frames, clock: Clock) -> None:
+async def test_a_viewer_that_was_away_gets_the_newest_message(frames: Frames, clock: Clock) -> None:
     first = await frames.after(-1)
     assert first is not None
     for _ in range(50):  # during this time, the viewer that has the first frame asks for no other
@@ -171,7 +175,7 @@ async def view(pictures: list[tuple[dict[str, Any], int]], begin: int) -> None:
         return whole[n]
 
     frames = Frames(make, clock, begin)
-    has: dict[int, dict[str, Any]] = {}  # by n: the data of the viewer that gets each n-th frame
+    has: dict[int, dict[str, Any]] = {}  # by viewer: its data; viewer 3 asks every third turn
     for turn, _ in enumerate(pictures):
         clock.now += 0.25
         frames.note_news()
@@ -197,7 +201,7 @@ def test_a_viewer_may_skip_frames(pictures: list[tuple[dict[str, Any], int]], be
     asyncio.run(view(pictures, begin))
 
 
-async def test_a_viewer_without_a_new_page_frame_gets_none_after_a_timeout_or_shutdown(
+async def test_a_waiting_viewer_gets_no_message_after_a_timeout_or_shutdown(
     frames: Frames, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "WAIT_S", 0.01)
@@ -232,7 +236,7 @@ async def test_too_many_viewers_get_an_error(frames: Frames, monkeypatch: pytest
 
 
 def test_frames_are_made_after_the_alarm_check(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """At most every 0.2 s, the gateway checks drives for alarms and then makes a page frame."""
+    """At most every 0.2 s, the gateway checks drives for alarms and then makes a message to the page."""
     gateway = Gateway(written(tmp_path), ServeSettings(port=0))
     gateway.listener.close()
     done: list[str] = []

@@ -358,7 +358,9 @@ def test_number_of_ended_alarms_that_are_kept_is_limited() -> None:
     assert len(events.shown()) <= 21
 
 
-def test_a_page_frame_has_null_for_values_that_are_overdue_or_failed(hub: Hub, clock: HubClock) -> None:
+def test_a_message_to_the_page_has_null_for_values_that_are_overdue_or_failed(
+    hub: Hub, clock: HubClock
+) -> None:
     hub.take(rows((10, FREQUENCY, 25), (10, CURRENT, 12), (11, CURRENT, Status.NO_REPLY)))
     for now, frequency, current in (
         (12, [25.0], [None, "no reply", 12.0]),  # a failed read is shown immediately
@@ -514,7 +516,7 @@ def test_home_assistant_gets_no_display_precision_for_a_float_register() -> None
     assert [parts[f"{name}_set"]["step"] for name in ("pressure", "level")] == [0.001, 0.01]
 
 
-def test_values_stay_current_for_the_cycle_of_the_reloaded_line(clock: HubClock) -> None:
+def test_a_reload_adapts_the_age_limit_of_values_to_the_line(clock: HubClock) -> None:
     """A reload adds drives to a line, and removes them. The first drive stays the same object."""
     first = polled(InvtCHE(1, name="pump-1"), [InvtCHE.output_frequency])
     others = [polled(InvtCHE(address), InvtCHE.readings()) for address in range(2, 20)]

@@ -1,4 +1,4 @@
-"""Each command names a page frame, by which delayed and repeated commands are recognised and refused."""
+"""A command has the number of the newest message to its page. So delayed or repeated commands are refused."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def times() -> Times:
     return Times()
 
 
-def test_a_command_is_accepted_until_its_page_frame_is_too_old(times: Times) -> None:
+def test_a_command_is_refused_if_its_message_to_the_page_is_too_old(times: Times) -> None:
     times.frames.note(7)
     made_ns = times.now_ns
     times.now_ns += MOST_AGE_NS
@@ -68,7 +68,7 @@ def test_a_command_is_accepted_until_its_page_frame_is_too_old(times: Times) -> 
     assert times.rule(7, command="jog") == TOO_LATE
 
 
-def test_a_command_with_an_unknown_page_frame_number_is_refused(times: Times) -> None:
+def test_a_command_with_an_unknown_message_number_is_refused(times: Times) -> None:
     times.frames.note(7)
     assert [times.rule(seen) for seen in (8, 6, -1, 0)] == [TOO_LATE] * 4
 
@@ -83,7 +83,7 @@ def test_a_stop_invalidates_earlier_commands_of_its_own_drive_only(times: Times)
     assert times.rule(8) == ""
 
 
-def test_a_command_with_a_page_frame_from_before_a_reload_is_refused(times: Times) -> None:
+def test_a_command_is_refused_if_a_reload_followed_its_message(times: Times) -> None:
     times.frames.note(7)
     times.commands.plant_ns = times.now_ns
     assert times.rule(7) == times.rule(7, "pump-2") == ANOTHER_PLANT
@@ -93,14 +93,14 @@ def test_a_command_with_a_page_frame_from_before_a_reload_is_refused(times: Time
     assert times.rule(7) == ANOTHER_PLANT
 
 
-def test_a_command_repeated_with_the_same_page_frame_number_is_refused(times: Times) -> None:
+def test_a_repeated_command_with_the_same_message_number_is_refused(times: Times) -> None:
     times.frames.note(7)
     assert [times.rule(7, command=one) for one in ("start", "jog", "start")] == ["", "", DOUBLED]
     times.frames.note(8)
     assert times.rule(8) == ""
 
 
-def test_old_page_frames_are_forgotten(times: Times) -> None:
+def test_old_messages_to_the_page_are_forgotten(times: Times) -> None:
     for n in range(1000):
         times.now_ns += 200_000_000
         times.frames.note(n)
@@ -138,7 +138,7 @@ def answer(client: socket.socket, last: bytes = b"}") -> str:
 
 
 def pass_time(gateway: Served, ns: int) -> None:
-    """Advance the clocks that the gateway uses for page frames and for commands."""
+    """Advance the clocks that the gateway uses for messages to the page and for commands."""
     gateway.gateway.seen_frames.clock = lambda: boottime_ns() + ns
 
 
@@ -168,7 +168,7 @@ def test_a_stop_is_sent_however_long_the_network_delayed_it(tmp_path: Path) -> N
         assert gateway.stands("pump-1")
 
 
-def test_a_start_with_a_page_frame_from_before_a_stop_is_not_sent(tmp_path: Path) -> None:
+def test_a_start_is_not_sent_if_a_stop_followed_its_message(tmp_path: Path) -> None:
     """A proxy that repeats or delays a start must not start a motor after a stop."""
     with served(tmp_path, MAY) as gateway:
         writer = gateway.writer
@@ -224,7 +224,7 @@ def test_a_stop_right_before_a_start_prevents_it(gateway: Served, monkeypatch: p
 
 
 @pytest.mark.slow
-def test_a_page_frame_number_of_a_previous_process_is_refused(tmp_path: Path) -> None:
+def test_a_message_number_of_a_previous_process_is_refused(tmp_path: Path) -> None:
     with served(tmp_path, MAY) as gateway:
         seen = gateway.frame_number()
     with served(tmp_path, MAY) as gateway:
@@ -236,7 +236,7 @@ def test_a_page_frame_number_of_a_previous_process_is_refused(tmp_path: Path) ->
 
 
 @table("wrong", [{}, {"seen": None}, {"seen": "7"}, {"seen": True}, {"seen": 1.5}, {"seen": 10**300}])
-def test_commands_without_a_frame_number_are_refused(gateway: Served, wrong: dict[str, Any]) -> None:
+def test_a_command_without_a_message_number_is_refused(gateway: Served, wrong: dict[str, Any]) -> None:
     before, called = commands(gateway), gateway.gateway.commands.called
     verbs = {"start": {}, "jog": {}, "reset_fault": {}, "set_frequency": {"hz": 20.0}}
     acts = [{"drive": "pump-1", "verb": verb, "options": options} for verb, options in verbs.items()]
@@ -246,7 +246,7 @@ def test_commands_without_a_frame_number_are_refused(gateway: Served, wrong: dic
     assert (commands(gateway), gateway.gateway.commands.called) == (before, called)
 
 
-def test_stops_need_no_page_frame_number(gateway: Served) -> None:
+def test_a_stop_needs_no_message_number(gateway: Served) -> None:
     for verb in ("stop", "coast"):
         told = gateway.post("/api/act", {"drive": "pump-1", "verb": verb, "options": {}}).json
         assert told["done"] is True
@@ -267,7 +267,7 @@ def test_the_start_command_in_the_documentation_works_from_a_shell(tmp_path: Pat
         assert json.loads(ran.stdout)["text"] == "pump-1: start is done"
 
 
-def test_page_frames_contain_the_number_of_stops_of_each_drive(gateway: Served) -> None:
+def test_messages_to_the_page_contain_the_number_of_stops_of_each_drive(gateway: Served) -> None:
     def stops() -> list[int]:
         return [gateway.frame()["drives"][name]["stops"] for name in ("pump-1", "pump-2")]
 

@@ -1,4 +1,4 @@
-"""Views of a plant over HTTP: description, page frames, a drive, lines, alarms, unpolled registers."""
+"""Views of a plant over HTTP: description, live values, a drive, lines, alarms, unpolled registers."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_a_line_is_described_with_the_baud_rates_of_all_its_drives() -> None:
     assert [drive["speed"] for drive in told["drives"]] == ["38400 8N1", "9600 8N1", "9600 8N1"]
 
 
-def test_a_page_frame_has_the_age_of_each_value(gateway: Served) -> None:
+def test_a_message_to_the_page_has_the_age_of_each_value(gateway: Served) -> None:
     gateway.sims["pump-1"]["output_current"] = 12.3
     frame: dict[str, Any] = {}
 
@@ -200,7 +200,7 @@ def test_api_lines_returns_the_reply_delays_of_each_drive(gateway: Served) -> No
 
 
 @pytest.mark.long
-def test_failed_reads_of_a_silent_drive_are_divided_by_the_requested_values(gateway: Served) -> None:
+def test_failed_reads_of_a_silent_drive_are_counted_per_value(gateway: Served) -> None:
     """A request reads several values at once. Both failures and requests are counted per value."""
     recent = gateway.gateway.recent
 
@@ -360,7 +360,9 @@ MAY_STOP = '[serve.may]\nstop = "anyone"\n'
 
 
 @pytest.mark.long
-def test_a_stop_reads_no_known_identity(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_is_sent_without_another_read_of_the_identity(
+    tmp_path: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """No identity is read between the call of the stop and the Modbus request that stops the drive."""
     asked: list[str] = []
     with served(tmp_path, MAY_STOP) as gateway:

@@ -303,7 +303,7 @@ def test_http_and_cli_give_the_same_address_map(tmp_path: Path, capsys: pytest.C
     assert "map.xls: the name of an address map must end in .csv or .json" in capsys.readouterr().err
 
 
-def test_the_address_map_states_32_bit_invalid_counts_and_bit_ranges_of_bytes(tmp_path: Path) -> None:
+def test_the_address_map_states_invalid_counts_and_bit_ranges_of_registers(tmp_path: Path) -> None:
     (tmp_path / "mixed.toml").write_text(FAMILY)
     (tmp_path / "plant.toml").write_text(PLANT.format(passing="declared", hall="/dev/a", yard="/dev/b"))
     assert main(["serve", str(tmp_path / "plant.toml"), "--modbus-map", str(tmp_path / "map.json")]) == 0

@@ -551,7 +551,7 @@ async def test_a_flooding_client_gets_exactly_a_fifth_of_the_line_time(seconds: 
 
 
 @pytest.mark.long
-async def test_line_time_used_in_any_second_is_at_most_the_clients_share_plus_a_burst() -> None:
+async def test_clients_get_a_limited_share_of_bus_time_in_each_second() -> None:
     share, line = LineShare(), PacedLine(0.01)
     await flood(share, line, 30.0)
     first = line.begun[0]

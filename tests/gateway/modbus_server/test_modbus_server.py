@@ -118,13 +118,13 @@ def test_undeclared_addresses_are_refused_by_default(gateway: Gateway) -> None:
     assert gateway.line.asked == []
 
 
-def test_the_setting_passing_any_lets_clients_read_undeclared_addresses() -> None:
+def test_clients_may_read_undeclared_addresses_if_passing_is_any() -> None:
     with serving(plant(), ModbusSettings(listen="127.0.0.1:0", passing="any")) as gateway:
         assert code(gateway, 1, 4, 0x7000, 2) is None
         assert gateway.line.asked == [("mill", 4, 0x7000, 2)]
 
 
-def test_the_setting_passing_off_answers_reads_without_requests_on_the_line() -> None:
+def test_a_read_causes_no_request_on_the_line_if_passing_is_off() -> None:
     with serving(plant(), ModbusSettings(listen="127.0.0.1:0", passing="off")) as gateway:
         gateway.hub.values["mill", "output_voltage"] = 231.0
         assert code(gateway, 1, 3, CHE_OUTPUT_VOLTAGE, 1) is None
@@ -282,7 +282,7 @@ def test_a_write_is_carried_out_by_the_gateways_commands_and_echoed(gateway: Gat
         (5, (6, 0xFF00), b"", 2),
         (15, (5, 2), b"\1\3", 3),
         (15, (5, 1), b"\2\0\0", 3),
-        # the common register block
+        # the registers that every drive has at the same addresses
         (6, (BLOCK + 10, 0), b"", 3),
         (6, (BLOCK, 1), b"", 2),
         (16, (BLOCK + 10, 2), b"\4\0\0\0\1", 3),
@@ -551,7 +551,7 @@ def test_unknown_values_in_the_common_register_block_read_as_reserved_numbers(ga
     assert 69_990 <= found[8] << 16 | found[9] < 80_000
 
 
-def test_values_from_before_a_sleep_are_unknown_in_the_common_register_block(gateway: Gateway) -> None:
+def test_the_registers_common_to_all_drives_show_no_value_read_before_a_sleep(gateway: Gateway) -> None:
     gateway.hub.values["mill", "output_frequency"] = 49.99
     gateway.hub.woken_ns = time.monotonic_ns() + 3600 * 10**9
     found = block(gateway)
@@ -560,13 +560,15 @@ def test_values_from_before_a_sleep_are_unknown_in_the_common_register_block(gat
 
 
 @table(("number", "expected"), [(5.0, 5), (None, 0xFFFE), (0.0, 0xFFFE)])
-def test_the_common_block_has_the_fault_number(gateway: Gateway, number: float | None, expected: int) -> None:
+def test_the_registers_common_to_all_drives_include_the_fault_number(
+    gateway: Gateway, number: float | None, expected: int
+) -> None:
     gateway.hub.states["mill"] = "fault"
     gateway.hub.values["mill", "fault"] = number
     assert block(gateway)[:2] == [3, expected]
 
 
-def test_reads_across_the_ends_of_the_common_register_block_are_refused(gateway: Gateway) -> None:
+def test_a_read_is_refused_if_only_a_part_of_it_is_in_the_common_registers(gateway: Gateway) -> None:
     gateway.hub.states["mill"] = "stands"
     with gateway.client() as client:
         assert client.ask(1, 3, BLOCK, 1).words == [1]

@@ -196,7 +196,7 @@ def test_a_modbus_tool_gets_no_reply_after_the_timeout_of_its_port(tmp_path: Pat
         until(lambda: rig.line.asked)
         assert receive(tool, 1, 0.4) == b""
         rig.line.seconds = 0.0
-        while len(rig.line.asked) < 2:  # a busy machine may answer the request with "busy"
+        while len(rig.line.asked) < 2:  # repeat it: under load, the gateway may answer "busy"
             os.write(tool, checksums.rtu("01 03 00 02 00 01"))
             time.sleep(0.05)
         time.sleep(0.2)  # longer than the port's timeout
@@ -204,7 +204,7 @@ def test_a_modbus_tool_gets_no_reply_after_the_timeout_of_its_port(tmp_path: Pat
 
 
 @pytest.mark.long
-def test_a_modbus_tool_that_exceeds_its_share_of_line_time_gets_exception_06(tmp_path: Path) -> None:
+def test_a_pc_tool_that_exceeds_its_share_of_bus_time_gets_exception_06(tmp_path: Path) -> None:
     with serving(tmp_path, timeout=1.0) as rig, opened(str(rig.link)) as tool:
         rig.ports.lines["hall"].share.share = 0.01
         rig.line.seconds = 0.06

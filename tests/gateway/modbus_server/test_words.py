@@ -81,10 +81,12 @@ def sent(draw: st.DrawFn) -> tuple[NumberFormat, str, float, float, bytes]:
 @example((NumberFormat.U64, "ABCD", 60, 0, (2**53 + 1).to_bytes(8)))
 @example((NumberFormat.I64, "ABCD", 1, 0, (-(2**53) - 1).to_bytes(8, signed=True)))
 @example((NumberFormat.F64, "ABCD", 0.1, 0, struct.pack(">d", 0.30000000000000004)))
-# lost in the sum with the offset of 1000
+# the sum of 1e-20 and the offset equals the offset, so that the raw value cannot be computed
 @example((NumberFormat.F64, "ABCD", 1, 1000, struct.pack(">d", 1e-20)))
 @example((NumberFormat.F32, "ABCD", 1, 273.15, struct.pack(">f", 1e-20)))
-def test_words_of_a_value_are_right_or_unknown(case: tuple[NumberFormat, str, float, float, bytes]) -> None:
+def test_register_words_computed_from_a_value_are_right_or_unknown(
+    case: tuple[NumberFormat, str, float, float, bytes],
+) -> None:
     number_format, order, step, offset, data = case
     register = declared(number_format=number_format, order=order, step=step, offset=offset)
     value = value_of(register, data)
@@ -93,7 +95,7 @@ def test_words_of_a_value_are_right_or_unknown(case: tuple[NumberFormat, str, fl
 
 
 @given(st.sampled_from(WHOLE), st.sampled_from(STEPS), st.sampled_from(OFFSETS), st.data())
-def test_words_can_be_computed_for_each_integer_value(
+def test_register_words_can_be_computed_from_each_integer_value(
     number_format: NumberFormat, step: float, offset: float, data: st.DataObject
 ) -> None:
     size = BYTES[number_format]
@@ -106,7 +108,7 @@ def test_words_can_be_computed_for_each_integer_value(
 
 
 @pytest.mark.slow
-def test_words_can_be_computed_for_each_16_bit_number() -> None:
+def test_register_words_can_be_computed_from_each_16_bit_number() -> None:
     """A usual run tests only every 19th raw count."""
     for step in (0.1, 0.01, -0.25):
         register = declared(step=step)
@@ -116,7 +118,7 @@ def test_words_can_be_computed_for_each_16_bit_number() -> None:
 
 
 @given(st.floats(width=32, allow_nan=False).filter(bool), st.sampled_from(ORDERS))
-def test_words_can_be_computed_for_each_float_other_than_zero(number: float, order: str) -> None:
+def test_register_words_can_be_computed_from_each_float_other_than_zero(number: float, order: str) -> None:
     register = declared(number_format=NumberFormat.F32, order=order)
     data = struct.pack(">f", number)
     places = {"ABCD": (0, 1, 2, 3), "CDAB": (2, 3, 0, 1), "BADC": (1, 0, 3, 2), "DCBA": (3, 2, 1, 0)}[order]
@@ -145,7 +147,7 @@ def test_no_words_are_computed_for_a_format_that_leaves_bits_undefined(details: 
     assert exact_data(declared(**details), 5.0) is None
 
 
-def test_no_words_are_computed_for_a_register_with_a_scale_register() -> None:
+def test_register_words_are_unknown_if_another_register_has_the_scale() -> None:
     family = type(
         "Scaled",
         (Drive,),
@@ -239,7 +241,7 @@ def test_a_range_with_an_old_value_or_a_failed_read_is_not_answered() -> None:
     assert cached().read(3, range(1), lambda name: None, NOW) is Unavailable.STALE
 
 
-def test_values_polled_before_a_write_are_not_used_for_words() -> None:
+def test_a_modbus_client_gets_no_value_polled_before_a_write() -> None:
     assert read(3, 1, 1, since_ns=NOW) == [2]
     assert read(3, 1, 1, since_ns=NOW + 1) is Unavailable.STALE
 

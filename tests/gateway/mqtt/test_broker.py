@@ -191,7 +191,7 @@ def test_a_burst_of_acknowledgements_wakes_the_event_loop_once(monkeypatch: pyte
     assert told[20:] == [20]
 
 
-def test_few_received_messages_wait_for_the_event_loop(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_number_of_received_messages_that_wait_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
     require_module("paho.mqtt.client")
     broker, loop, handled = (
         Broker(parse_broker("mqtt://localhost"), Login(), "a", Silent()),

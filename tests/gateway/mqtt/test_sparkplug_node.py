@@ -237,7 +237,9 @@ async def test_a_retained_message_can_stop_but_not_write(tmp_path: Path, *, is_r
     assert known.commands.noted == [*written, ("stop", ["pump-1"])]
 
 
-def test_a_reload_sends_deaths_and_births(broker: Broker, host: Host, node: tuple[Any, Running]) -> None:
+def test_a_reload_publishes_death_and_birth_certificates_of_drives(
+    broker: Broker, host: Host, node: tuple[Any, Running]
+) -> None:
     known, running = node
     host.wait_for("DBIRTH", FAN.name)
     running.adopt(without_fan(known))
@@ -439,8 +441,8 @@ def test_live_values_have_the_time_of_their_poll(host: Host, row_node: tuple[Any
     assert (metric.timestamp, metric.is_historical) == (7, False)
 
 
-def test_a_reload_without_a_connection_sends_births_of_changed_drives(tmp_path: Path) -> None:
-    """The part publishes without a connection too; the outbox keeps the newest message of each topic."""
+def test_a_reload_without_a_connection_prepares_new_birth_certificates(tmp_path: Path) -> None:
+    """Messages are made without a connection too. The outbox keeps the newest one of each topic."""
     known = inside(tmp_path)
     node = SparkplugNode(MqttSettings(sparkplug="works", node="line"), known, lambda: 7)
     node.outbox = Outbox(lambda message: None)

@@ -239,7 +239,7 @@ def test_the_stop_method_stops_motors(gateway: Served, client: Any, drive: str, 
 
 
 @pytest.mark.slow
-def test_a_stop_method_of_another_drive_is_sent_but_not_confirmed(
+def test_a_stop_method_called_on_the_wrong_object_still_stops_its_drive(
     gateway: Served, client: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     gateway.start("pump-1", "pump-2")
@@ -342,7 +342,8 @@ def test_opc_ua_clients_have_the_rights_of_their_tokens(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_an_opc_ua_client_with_a_wrong_token_can_only_stop_drives_if_anyone_may(gateway: Served) -> None:
+def test_a_client_with_a_wrong_token_can_stop_drives_but_not_read_them(gateway: Served) -> None:
+    """The setting stop = "anyone" applies to this client as to clients without a token."""
     client = Client(url_of(gateway), timeout=PATIENCE)
     client.set_user("anna")
     client.set_password("revoked")
@@ -495,7 +496,9 @@ def test_each_row_has_the_expected_opc_ua_status_code(
         (hub.Shown(hub.SILENT, "no reply"), ("Bad_NoCommunication", None)),
     ],
 )
-def test_the_status_no_fault_needs_proving_values(shown: hub.Shown, expected: tuple[str, str | None]) -> None:
+def test_no_fault_is_reported_only_if_polled_values_prove_it(
+    shown: hub.Shown, expected: tuple[str, str | None]
+) -> None:
     code, text = fault_of(shown)
     assert (NAMES[code], text) == expected
 

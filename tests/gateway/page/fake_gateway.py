@@ -24,9 +24,9 @@ HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Cross-Origin-Resource-Policy": "same-origin",
 }
-FRAMES_A_SECOND = 5  # page frames a second, as the real gateway's limit
-REMEMBERED = 5  # number of page frames kept
-HOLD_S = 20  # s until a request that waits for a page frame is answered with 304
+FRAMES_A_SECOND = 5  # limit of messages to the page per second, as in the real gateway
+REMEMBERED = 5  # number of messages to the page that are kept
+HOLD_S = 20  # seconds until a request that waits for a new message is answered with 304
 
 
 class FakeGateway:
@@ -35,12 +35,12 @@ class FakeGateway:
     def __init__(self, port: int = 0) -> None:
         self.renamed: dict[str, str] = {}
         self.stuck: dict[str, float] = {}  # by drive: time (s) since which it has not been polled
-        self.clocked: str | None = None  # name of a drive whose frequency is the time
+        self.clocked: str | None = None  # drive whose frequency changes with the time
         self.plant_changes: dict[str, Any] = {}  # keys of the plant description to replace
-        self.changes: dict[str, Any] = {}  # keys of the page frame to replace
-        self.drive_changes: dict[str, dict[str, Any]] = {}  # by drive: keys to replace in the page frame
+        self.changes: dict[str, Any] = {}  # keys to replace in messages to the page
+        self.drive_changes: dict[str, dict[str, Any]] = {}  # keys to replace in a drive's entry, by drive
         self.posts: list[tuple[str, Any]] = []  # path and body of each POST request
-        self.seen: list[int] = []  # for each command: number of the page frame that it names
+        self.seen: list[int] = []  # for each command: the number in its key `seen`
         self.stops: dict[str, int] = {}  # by drive: number of stops called so far
         self.is_held: threading.Event | None = None  # if set, answers to stops wait for this event
         self.confirms = False  # True: send the HTTP head of an answer before the rest is ready
@@ -51,7 +51,7 @@ class FakeGateway:
         self.triggers: list[dict[str, Any]] = []  # the last triggers, newest first
         self.knows_since = 0  # UTC in ms since which all alarms are known
         self.maximum_hz = 50.0  # maximum frequency of all drives
-        self.has_changed = False  # True: acknowledging an alarm fails, because there is no such alarm
+        self.has_no_alarm = False  # True: an acknowledgement is answered with "there is no such alarm"
         # successive answers about parameters; the last is repeated
         self.parameters: list[dict[str, Any]] = []
         self.fleet: dict[str, Any] = {}  # keys of /api/fleet to replace
@@ -62,12 +62,12 @@ class FakeGateway:
             "mistakes": [],
             "restart": [],
         }
-        self.is_silent = False  # True: requests for page frames get no answer
-        self.stands_still = False  # True: no further page frames are made
+        self.is_silent = False  # True: requests for messages to the page get no answer
+        self.stands_still = False  # True: no further messages to the page are made
         self.began = time.time()
         self.outcomes: dict[str, dict[str, Any]] = {}
         self._lock = threading.Lock()
-        self._made: dict[int, dict[str, Any]] = {}  # by number: the page frames kept
+        self._made: dict[int, dict[str, Any]] = {}  # kept messages to the page, by their number
         self._sockets: set[socket.socket] = set()
         self._server = _Server(("127.0.0.1", port), _handler(self))
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.02,), daemon=True)
@@ -84,11 +84,11 @@ class FakeGateway:
                 connection.shutdown(socket.SHUT_RDWR)
 
     def number(self) -> int:
-        """Return the number of the newest page frame."""
+        """Return the number of the newest message to the page."""
         return 1 if self.stands_still else int((time.time() - self.began) * FRAMES_A_SECOND) + 1
 
     def encoded(self, after: int) -> bytes:
-        """Return the newest page frame; only its changes since frame `after`, if that frame is kept."""
+        """Return the newest message to the page; only its changes if message `after` is still kept."""
         with self._lock:
             number = self.number()
             if number not in self._made:
@@ -204,7 +204,7 @@ def _handler(gateway: FakeGateway) -> type[BaseHTTPRequestHandler]:
             if self.path == "/api/reload":
                 self.tell(gateway.reloaded)
             elif self.path == "/api/acknowledge":
-                self.tell({"error": "there is no such alarm"}, 404) if gateway.has_changed else self.tell({})
+                self.tell({"error": "there is no such alarm"}, 404) if gateway.has_no_alarm else self.tell({})
             elif self.path == "/api/fleet/stop":
                 self.tell(gateway.fleet_outcomes)
             elif self.path == "/api/stop":

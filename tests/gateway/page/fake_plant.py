@@ -163,7 +163,7 @@ def ms(seconds: float) -> int:
 
 
 def frame(n: int, began: float, renamed: dict[str, str], stuck: dict[str, float]) -> dict[str, Any]:
-    """Return a page frame. `stuck`: drives that are no longer polled, with the time (s) of the last poll."""
+    """Return a message to the page. `stuck`: drives that are not polled, and their last poll (s)."""
     now = time.time()
     drives = {}
     for number, name in enumerate(" ".join(NAMES).split()):

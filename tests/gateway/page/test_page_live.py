@@ -22,7 +22,7 @@ FRESH = "tr.drive td.frequency .value:not(.old)"
 
 @pytest.mark.usefixtures("many_drives")
 def test_the_web_page_shows_live_values_of_all_drives(opened: Opener, gateway: FakeGateway) -> None:
-    gateway.clocked = "pump-1"  # the frequency of this drive is the time
+    gateway.clocked = "pump-1"  # the frequency of this drive changes with the time
     page = opened()
     assert page.locator("tr.drive").count() == 31
     number = cell(page, "pump-1", "frequency").locator(".number")
@@ -76,7 +76,7 @@ def test_the_page_is_live_again_after_a_restart(opened: Opener, gateway: FakeGat
     page = opened()
     gateway.kill()
     until(page, "document.body.classList.contains('dead')")
-    again = FakeGateway(gateway.port)  # numbers page frames from 1 again
+    again = FakeGateway(gateway.port)  # its messages to the page start at number 1 again
     try:
         until(page, LIVE)
         until_met(page, lambda: page.locator(FRESH).count() == 9)
@@ -133,7 +133,7 @@ def test_values_stay_old_when_the_gateways_clock_is_set_back(opened: Opener) -> 
     assert not is_old
 
 
-def test_values_of_a_slow_line_stay_current_as_long_as_the_gateway_reports(
+def test_the_gateway_states_how_long_the_page_shows_a_value_as_current(
     opened: Opener, gateway: FakeGateway, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Here the gateway reports that values stay current for ten minutes."""
@@ -271,7 +271,7 @@ def test_a_plot_draws_no_line_over_a_time_without_values(opened: Opener) -> None
     assert seen == [[False], [True, False], [False]]
 
 
-def test_a_plot_of_the_newest_samples_has_counters_of_32_bits_exactly(opened: Opener) -> None:
+def test_a_plot_of_the_newest_samples_does_not_round_32_bit_counters(opened: Opener) -> None:
     numbers = [2**32 - 1 - at for at in range(100)]
     added = """numbers => import('/page/data/ring.js').then(({ Ring }) => {
         const ring = new Ring(200);

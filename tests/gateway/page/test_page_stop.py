@@ -325,7 +325,7 @@ def test_eight_tabs_with_six_connections_show_live_values_and_can_stop_drives(
     """A browser allows six connections to a host. The requests of other tabs hold all six."""
     # so long that a stop which waits for these requests would fail the test
     monkeypatch.setattr(fake_gateway, "HOLD_S", 2 * PATIENCE_S)
-    gateway.clocked = "pump-1"  # the frequency of this drive is the time
+    gateway.clocked = "pump-1"  # the frequency of this drive changes with the time
     context = browser.new_context(viewport={"width": 390, "height": 844})  # without plots
     pages = [context.new_page() for _ in range(8)]
     for page in pages:
@@ -348,7 +348,9 @@ def test_eight_tabs_with_six_connections_show_live_values_and_can_stop_drives(
 
 
 @pytest.mark.parametrize("case", ["a write that wants a token", "a reload"])
-def test_a_late_dialog_does_not_replace_a_stops_own(opened: Opener, gateway: FakeGateway, case: str) -> None:
+def test_a_late_dialog_does_not_replace_the_dialog_of_a_stop(
+    opened: Opener, gateway: FakeGateway, case: str
+) -> None:
     """The answer to an earlier request arrives while the question is open."""
     path = "api/reload" if case == "a reload" else "api/write"
     held: list[Any] = []

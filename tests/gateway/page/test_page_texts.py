@@ -56,7 +56,7 @@ GATEWAY_WORDS = {
 }
 # names of functions whose first argument is a key of the catalogue of texts
 TRANSLATING = {"t", "pieces", "said"}
-# By function of the page: index of the first argument that it shows to the user.
+# Functions of the page that show their arguments to the user, and the index of the first shown argument.
 SHOWING = {"make": 2, "put": 1, "fill": 1, "named": 0, "say": 0, "Error": 0, "Refused": 1}
 SHOWN = {"title", "aria-label", "placeholder", "alt", "data-head"}  # HTML attributes that the user can read
 TECHNICAL = {"class", "find", "closest", "matches", "matchMedia", "querySelector", "querySelectorAll"}
@@ -197,8 +197,11 @@ def test_a_visible_text_outside_the_catalogue_is_found(script: str) -> None:
     assert strangers(script) != []
 
 
-def test_each_text_of_the_html_comes_from_the_catalogue_and_css_has_none() -> None:
+def test_each_text_of_the_html_is_in_the_catalogue_of_translations() -> None:
     assert HtmlTexts().texts - TEXTS.keys() - NAMES == set()
+
+
+def test_the_css_contains_no_texts() -> None:
     styles = "".join(path.read_text("utf-8") for path in PAGE.glob("style/*.css"))
     assert [text for text in re.findall(r"content:([^;]*);", styles) if re.search(r'"[^"]*\w', text)] == []
 

@@ -449,7 +449,7 @@ def test_time_before_the_start_is_not_shown_as_free_of_faults(opened: Opener, ga
     assert all(abs(part - 0.5) < 0.02 for part in lanes.evaluate_all(part))
 
 
-def test_a_second_unit_has_its_own_plot_and_others_are_listed(opened: Opener, gateway: FakeGateway) -> None:
+def test_a_register_recorded_in_a_second_unit_has_a_second_plot(opened: Opener, gateway: FakeGateway) -> None:
     gateway.recorded = {
         "pump-1.output_current": {"unit": "%", "left_out": ["A", ""]},
         "pump-2.output_current": {"unit": "A", "left_out": []},

@@ -35,7 +35,7 @@ TELL_NUMBERS = """async numbers => {
 }"""
 
 
-def test_numbers_have_the_digits_of_their_register_and_floats_have_all_digits(opened: Opener) -> None:
+def test_a_number_is_shown_with_the_decimal_places_of_its_register(opened: Opener) -> None:
     # 0.1 as float32, which the core delivers as 0.10000000149011612
     single = struct.unpack(">f", struct.pack(">f", 0.1))[0]
     told = {
@@ -176,7 +176,9 @@ def test_the_age_of_an_old_value_is_shown(opened: Opener) -> None:
     until_met(page, lambda: bool(re.fullmatch(r"\d+ min", row.locator(".age").inner_text())))
 
 
-def test_values_read_for_a_viewer_become_old_with_their_drive(opened: Opener, gateway: FakeGateway) -> None:
+def test_a_value_read_for_a_viewer_is_old_if_its_drive_is_silent(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     """A viewed register may be read only once a minute. Its value stays current while the drive answers."""
     page = opened()
     value = page.locator("#panel tr", has_text="run hours").locator(".value")
@@ -255,7 +257,7 @@ def test_an_alarm_is_acknowledged_with_a_note(opened: Opener, alarmed: FakeGatew
     page.get_by_role("button", name="Acknowledge").last.click()
     until_met(page, lambda: alarmed.posts)
     assert alarmed.posts == [("/api/acknowledge", {"alarm": ALARMS[0]["id"], "note": "belt stuck"})]
-    alarmed.has_changed = True
+    alarmed.has_no_alarm = True
     page.get_by_role("button", name="Acknowledge").first.click()
     page.get_by_role("button", name="Acknowledge").last.click()
     page.get_by_role("heading", name="The alarm was not acknowledged").wait_for()

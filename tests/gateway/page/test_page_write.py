@@ -198,7 +198,9 @@ def test_early_keys_confirm_no_dialog(opened: Opener, gateway: FakeGateway, key:
     assert gateway.posts == [("/api/act", {"drive": "pump-1", "verb": "start", "options": {}})]
 
 
-def test_a_command_names_the_frame_shown_at_its_confirmation(opened: Opener, gateway: FakeGateway) -> None:
+def test_a_command_has_the_number_of_the_message_shown_at_its_confirmation(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     page = opened("#/drives/pump-1")
     newest = "import('/page/data/store.js').then(m => m.store.frame.n)"
     page.get_by_role("button", name="start").click()

@@ -104,7 +104,7 @@ PENDING: WeakKeyDictionary[Any, set[Any]] = WeakKeyDictionary()
 
 
 def note_requests(page: Any) -> None:
-    """Keep a set of the page's pending requests for `until_settled`, without requests for page frames."""
+    """Keep a set of the page's pending requests, except those to /api/frame, for `until_settled`."""
     pending = PENDING[page] = set[Any]()
     page.on("request", lambda request: "/api/frame" in request.url or pending.add(request))
     for event in ("requestfinished", "requestfailed"):
@@ -112,7 +112,7 @@ def note_requests(page: Any) -> None:
 
 
 def until_settled(page: Any) -> None:
-    """Wait until no request is pending except that for the next page frame, and all animations have ended."""
+    """Wait until only the request for the next message is pending, and all animations have ended."""
     page.wait_for_timeout(200)  # a view may send its requests up to 150 ms after it is opened
     until_met(page, lambda: not PENDING[page], "pending requests")
     until_still(page)
