@@ -10,13 +10,12 @@ import asyncio
 import logging
 from collections import Counter
 from collections.abc import Awaitable, Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from math import inf
 from typing import Any, Protocol
 
 from multidrop import Register, WriteForbidden
-from multidrop.control.commands import MOST_STOPS
+from multidrop.control.commands import JoinedStops
 from multidrop.drive import Carrier
 from multidrop.gateway.clock import boottime_ns
 from multidrop.gateway.commands import MOST_AGE_S, STOOD_STILL, Commands
@@ -224,7 +223,7 @@ class ClientWrites:
         self._admit = standstill.admit
         self._common = common or range(0)
         self._common_stop = common.start + STOP if common else None
-        self._stops: dict[str, set[asyncio.Task[int]]] = {}  # stops in progress, by drive
+        self._stops = JoinedStops()
         # by line: when the latest audit entry about a refused write was made
         self._recorded: dict[str, float] = {}
 
@@ -242,9 +241,7 @@ class ClientWrites:
         register = unit.writable(carrier, address)
         is_one = count == (register.words if register else 1)
         if not is_one and unit.has_stop_in(written, self._common_stop):
-            # Declined here means that enough stops of the drive are in progress already
-            with suppress(Declined):
-                self._begin_stop(unit, client)
+            self._begin_stop(unit, client)
             # refuse the rest of the words, because they may start a motor
             raise Declined(ModbusCode.ILLEGAL_VALUE)
         if carrier is Carrier.WORD and address in self._common:
@@ -269,7 +266,7 @@ class ClientWrites:
         write = self._write_one(unit, register, raw, request, client)
         return self._later(request, supervisor().start("modbus write", write), None)
 
-    async def _later(self, request: MbapRequest, task: asyncio.Task[int], wait_s: float | None) -> bytes:
+    async def _later(self, request: MbapRequest, task: asyncio.Future[int], wait_s: float | None) -> bytes:
         """Return the answer to a command.
 
         If it takes longer than `wait_s`, return "acknowledge"; the command continues.
@@ -300,16 +297,13 @@ class ClientWrites:
             what = f"request {request.text}"
             self._commands.note_refused(line, drive, what, why, self._caller(client))
 
-    def _begin_stop(self, unit: Unit, client: WritingClient) -> asyncio.Task[int]:
-        """Start a stop immediately. Raises Declined if MOST_STOPS of this drive are in progress."""
-        name = unit.drive.name
-        under_way = self._stops.setdefault(name, set())
-        if len(under_way) >= MOST_STOPS:
-            raise Declined(ModbusCode.ACKNOWLEDGE)
-        task = supervisor().start("modbus stop", self._stop_one(unit, self._caller(client)))
-        under_way.add(task)
-        task.add_done_callback(under_way.discard)
-        return task
+    def _begin_stop(self, unit: Unit, client: WritingClient) -> asyncio.Future[int]:
+        """Start a stop; a stop beyond many that are in progress is joined with others, and starts later."""
+
+        def start() -> asyncio.Task[int]:
+            return supervisor().start("modbus stop", self._stop_one(unit, self._caller(client)))
+
+        return self._stops.begin(unit.drive.name, start)
 
     async def _stop_one(self, unit: Unit, caller: Caller) -> int:
         name = unit.drive.name
