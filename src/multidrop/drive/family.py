@@ -536,7 +536,7 @@ class Drive(RegisterAccess):
     @verb
     def release_control(self) -> Script[None]:
         """Return control of the motor to the drive's panel or terminals; allowed only at rest."""
-        raise self._unsupported("way to return control")
+        raise self._unsupported("command that returns control")
         yield
 
     @verb

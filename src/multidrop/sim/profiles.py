@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from multidrop.drive.family import Drive
-from multidrop.families.profiles.delta import (
+from multidrop.families.profiles.command_codes import (
     FORWARD,
     REVERSE,
     RUNNING,
@@ -15,6 +15,11 @@ from multidrop.families.profiles.delta import (
     Delta,
     DeltaReset,
     DeltaStatus,
+    Inovance,
+    InovanceStatus,
+    Invt,
+    InvtControl,
+    InvtStatus,
 )
 from multidrop.families.profiles.iec_61800_7 import (
     CiA402,
@@ -24,7 +29,6 @@ from multidrop.families.profiles.iec_61800_7 import (
     ProfidriveControl,
     ProfidriveStatus,
 )
-from multidrop.families.profiles.invt import Inovance, InovanceStatus, Invt, InvtControl, InvtStatus
 from multidrop.families.profiles.run_bits import (
     DanfossControl,
     DanfossFC,

@@ -13,7 +13,7 @@ from multidrop.control.ramp import ramp
 from multidrop.core import Framing, Message, build_reply
 from multidrop.drive import Condition, Direction, Drive
 from multidrop.errors import NotVerified, Unconfirmed, WriteForbidden
-from multidrop.families.profiles.invt import InvtControl
+from multidrop.families.profiles.command_codes import InvtControl
 
 FAULT = 4
 

@@ -29,7 +29,7 @@ from free_ports import free_ports
 from kills import BoundProcess
 
 from multidrop import Plant
-from multidrop.families.profiles.delta import DeltaControl
+from multidrop.families.profiles.command_codes import DeltaControl
 from multidrop.sim import serve
 
 FAMILY = """[family]

@@ -6,9 +6,8 @@ A family is a class that derives from a profile and declares its registers, or a
 
 from collections.abc import Mapping
 
-from multidrop.families.profiles.delta import Delta
+from multidrop.families.profiles.command_codes import Delta, Inovance, Invt
 from multidrop.families.profiles.iec_61800_7 import CiA402, Profidrive
-from multidrop.families.profiles.invt import Inovance, Invt
 from multidrop.families.profiles.profile import Profile, Role
 from multidrop.families.profiles.run_bits import DanfossFC, Optidrive, Yaskawa
 
