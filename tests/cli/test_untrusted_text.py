@@ -30,7 +30,7 @@ from multidrop.families import InvtCHE
 from multidrop.families.files import notation
 from multidrop.gateway.http.messages import Denied, number_in
 from multidrop.gateway.settings import read_plant
-from multidrop.importers.numbers import count, number
+from multidrop.importers.parsing import count, number
 from multidrop.plant.loader import PlantError, load_plant
 from multidrop.printable import masked, plain_number, plain_whole, printable
 from multidrop.recording.csv import _parse

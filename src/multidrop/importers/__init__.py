@@ -16,10 +16,10 @@ from multidrop.importers.device import ImportedDevice
 from multidrop.importers.esphome import is_esphome, read_esphome
 from multidrop.importers.family_writer import drop_undeclarable, family_text, plant_text
 from multidrop.importers.home_assistant import read_home_assistant
+from multidrop.importers.parsing import parse_yaml
 from multidrop.importers.sunspec import is_sunspec, read_sunspec
 from multidrop.importers.telegraf import read_telegraf
 from multidrop.importers.wb import json_without_comments, read_wb
-from multidrop.importers.yaml_text import parse_yaml
 from multidrop.printable import printable
 from multidrop.toml_document import DocumentError, parse_document, read_bounded
 

@@ -17,7 +17,7 @@ from fractions import Fraction
 from multidrop.families.files.notation import Counting
 from multidrop.importers.device import ImportedDevice, ImportedRegister, unit_address
 from multidrop.importers.modpoll import read_modpoll
-from multidrop.importers.numbers import (
+from multidrop.importers.parsing import (
     bits_text,
     format_of_width,
     number,

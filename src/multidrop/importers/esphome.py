@@ -20,8 +20,7 @@ from multidrop.importers.device import (
     unimported_keys,
     unit_address,
 )
-from multidrop.importers.numbers import bits_text, number, put_number, scaled, whole, words_of
-from multidrop.importers.yaml_text import YamlTag
+from multidrop.importers.parsing import YamlTag, bits_text, number, put_number, scaled, whole, words_of
 
 PLATFORM = "modbus_controller"
 _TABLES = {"coil": "coil", "discrete_input": "discrete", "holding": "holding", "read": "input"}

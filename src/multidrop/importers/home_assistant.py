@@ -21,8 +21,7 @@ from multidrop.importers.device import (
     unimported_keys,
     unit_address,
 )
-from multidrop.importers.numbers import count, put_number, scaled, whole, words_of
-from multidrop.importers.yaml_text import YamlTag
+from multidrop.importers.parsing import YamlTag, count, put_number, scaled, whole, words_of
 
 _SWAPS = {"byte": "BADC", "word": "CDAB", "word_byte": "DCBA", "none": "", "": ""}
 _TABLES = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 from multidrop.importers.device import ImportedDevice, ImportedRegister, unit_address
-from multidrop.importers.numbers import number_format, put_number, scaled, whole, words_of
+from multidrop.importers.parsing import number_format, put_number, scaled, whole, words_of
 
 _TABLES = {
     **{"coil": "coil", "discrete_input": "discrete"},

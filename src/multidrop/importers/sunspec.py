@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from multidrop.importers.device import ImportedDevice, ImportedRegister, key_table, unimported_keys
-from multidrop.importers.numbers import number_format, put_number, whole, words_of
+from multidrop.importers.parsing import number_format, put_number, whole, words_of
 
 POINT_KEYS = key_table(
     imported="name type size count sf units access symbols label",

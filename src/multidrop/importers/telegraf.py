@@ -19,7 +19,7 @@ from multidrop.importers.device import (
     unimported_keys,
     unit_address,
 )
-from multidrop.importers.numbers import TABLES, number_format, put_number, scaled, whole, words_of
+from multidrop.importers.parsing import TABLES, number_format, put_number, scaled, whole, words_of
 
 _REGISTER_STYLE = {
     "holding_registers": "holding",

@@ -24,7 +24,7 @@ from multidrop.importers.device import (
     unimported_keys,
     unit_address,
 )
-from multidrop.importers.numbers import bits_text, count, float_of_bits, put_number, scaled, whole, words_of
+from multidrop.importers.parsing import bits_text, count, float_of_bits, put_number, scaled, whole, words_of
 
 # Matches strings, which are kept, and comments and trailing commas, which JSON forbids. A string or comment
 # without an end extends to the end of the text, so that each character is scanned only once.
