@@ -68,7 +68,7 @@ TABLE = """
 """
 
 
-def test_erman_registers_equal_the_table_typed_from_section_10() -> None:
+def test_erman_registers_equal_the_table_of_section_10() -> None:
     assert rows(ErmanERG220) == typed(TABLE)
 
 

@@ -62,7 +62,7 @@ TABLE = """
 """
 
 
-def test_innovert_ibd_registers_equal_the_table_typed_from_appendix_2() -> None:
+def test_innovert_ibd_registers_equal_the_table_of_appendix_2() -> None:
     assert rows(InnovertIBD) == typed(TABLE)
 
 

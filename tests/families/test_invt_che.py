@@ -77,7 +77,7 @@ TABLE = """
 """
 
 
-def test_invt_che_registers_equal_the_table_typed_from_the_che100_manual() -> None:
+def test_invt_che_registers_equal_the_table_of_the_che100_manual() -> None:
     assert rows(InvtCHE) == typed(TABLE)
     assert all(register.outside for register in InvtCHE.registers.values())
     signed = {name for name, each in InvtCHE.registers.items() if each.number_format is NumberFormat.I16}

@@ -332,7 +332,7 @@ def test_family_files_of_the_package_are_found_by_name() -> None:
 
 
 @every_family
-def test_registers_of_a_family_file_equal_the_table_typed_from_the_manual(name: str) -> None:
+def test_registers_of_a_family_file_equal_the_table_of_the_manual(name: str) -> None:
     inherited = rows(MODELS[EXTENDED[name]]) if name in EXTENDED else set()
     assert rows(shipped_family(name)) - inherited == typed(TABLES[name])
 

@@ -1,4 +1,4 @@
-"""Delixi's own protocol: the register tables, and the frames of verbs, as part 3 of the document has them."""
+"""Delixi 9200 and 9100-SC: the register tables, and the frames that verbs send, as the document has them."""
 
 from __future__ import annotations
 
@@ -11,27 +11,228 @@ from tables import table
 
 from multidrop.control.eeprom_ledger import Ledger
 from multidrop.drive import Condition, Direction, Framing, NotVerified, State, Unconfirmed, WriteForbidden
-from multidrop.drive.register import Carrier, Kept, setting
+from multidrop.drive.register import HOLDING, Carrier, Kept, setting
 from multidrop.errors import NoReply
 from multidrop.families.delixi import (
     PARAMETER,
     PARAMETER_RAM,
     DelixiBaudrate,
     DelixiFault,
+    DelixiModbus,
+    DelixiModbusControl,
     DelixiNative,
     DelixiNativeStatus,
     DelixiRunSource,
     parameter,
 )
 
-FORWARD = ":010200020000000005"  # printed in the document
-FIFTY = ":0104000100001388A1"  # printed in the document
-FIFTY_STORED = ":0106000200001388A4"  # printed in the document
-STOP = ":010200010000000004"
-REVERSE = ":010200030000000006"
-RESET = ":010200040000000007"
+# ---- standard Modbus ----
 
-STANDING = {
+
+MODBUS_FORWARD = {
+    Framing.RTU: "01 06 20 00 00 12 02 07",
+    Framing.ASCII: ":010620000012C7",
+}  # printed in its manual
+MODBUS_FIFTY = {
+    Framing.RTU: "01 06 00 02 13 88 25 5C",
+    Framing.ASCII: ":0106000213885C",
+}  # printed in its manual
+MODBUS_STOP = {Framing.RTU: "01 06 20 00 00 01 43 CA", Framing.ASCII: ":010620000001D8"}
+MODBUS_REVERSE = {Framing.RTU: "01 06 20 00 00 22 02 13", Framing.ASCII: ":010620000022B7"}
+
+MODBUS_STANDING = {
+    "output_frequency": 0.0,
+    "fault": DelixiFault.NONE,
+    "run_source": DelixiRunSource.LINE,
+    "frequency_source": 1,
+    "frequency": 50.0,
+    "address_setting": 1,
+    "baudrate_setting": DelixiBaudrate.B9600,
+}
+MODBUS_TURNING = {"output_frequency": 12.0}
+MODBUS_TURNS = {
+    each: MODBUS_TURNING for frames in (MODBUS_FORWARD, MODBUS_REVERSE) for each in frames.values()
+} | {each: {"output_frequency": 0.0} for each in MODBUS_STOP.values()}
+
+MODBUS_TABLE = """
+03/06 2000 control           - DelixiModbusControl
+03/06 0002 frequency      0.01 Hz
+"""
+
+
+def test_delixi_modbus_registers_equal_the_table_of_the_document() -> None:
+    shared = "\n".join(f"03/06 {line}" for line in DELIXI_MONITORS.strip().splitlines())
+    assert rows(DelixiModbus) == typed(MODBUS_TABLE + shared)
+
+
+def test_delixi_line_settings_and_limits_are_those_of_the_document() -> None:
+    assert str(DelixiModbus(31).settings) == "9600 8N2"
+    assert str(DelixiModbus(1, framing="ascii").settings) == "9600 7N2"
+    assert DelixiModbus.formats[Framing.RTU] == ("8N2", "8E1", "8O1")
+    assert DelixiModbus.formats[Framing.ASCII] == ("7N2", "7E1", "7O1")
+    assert sorted(DelixiModbus.baudrates) == [1200, 2400, 4800, 9600, 19200, 38400]
+    assert DelixiModbus.addresses == range(1, 32)
+    assert DelixiModbus.most_registers == {HOLDING: 1}
+    with pytest.raises(ValueError, match="7N2"):
+        DelixiModbus(1, framing="ascii", format="8N2")
+
+
+def test_delixi_run_words_have_a_direction_and_never_the_toggle_bit() -> None:
+    assert {each.value for each in DelixiModbusControl} == {0x00, 0x01, 0x12, 0x22, 0x13, 0x23}
+
+
+def test_delixi_character_formats_have_the_codes_of_the_manual() -> None:
+    """P04.29: 0 to 2 are ASCII with 7 data bits, 3 to 5 RTU with 8."""
+    names = ["ASCII_7N2", "ASCII_7E1", "ASCII_7O1", "RTU_8N2", "RTU_8E1", "RTU_8O1"]
+    assert [DelixiModbus.format_setting.decode(raw).name for raw in range(6)] == names
+
+
+def test_delixi_start_after_a_jog_requires_a_stop() -> None:
+    jog = frame(DelixiModbus(1), DelixiModbus.control, DelixiModbusControl.JOG_FORWARD)
+    wire = Wire(DelixiModbus(1), MODBUS_STANDING, turns={jog: MODBUS_TURNING} | MODBUS_TURNS)
+    wire.drive.jog()
+    with pytest.raises(WriteForbidden, match=r"may still jog.*call stop\(\) first"):
+        wire.drive.start(Direction.FORWARD)
+    wire.drive.stop()
+    wire.drive.start(Direction.FORWARD)
+    wire.drive.start(Direction.REVERSE)  # the motor already runs
+    assert wire.sent == [
+        jog,
+        MODBUS_STOP[Framing.RTU],
+        MODBUS_FORWARD[Framing.RTU],
+        MODBUS_REVERSE[Framing.RTU],
+    ]
+
+
+def test_delixi_fault_codes_decode_to_the_documented_names() -> None:
+    assert [each.value for each in DelixiFault] == list(range(15))
+    assert DelixiModbus.fault.decode(14) is DelixiFault.FLT_MODULE
+
+
+@table("framing", DelixiModbus.framings)
+def test_each_delixi_verb_sends_the_documented_frame(framing: Framing) -> None:
+    wire = Wire(DelixiModbus(1, framing=framing), MODBUS_STANDING, turns=MODBUS_TURNS)
+    wire.drive.set_frequency(50)
+    wire.drive.start()
+    wire.drive.start(Direction.FORWARD)
+    wire.drive.start(Direction.REVERSE)
+    wire.drive.stop()
+    forward = MODBUS_FORWARD[framing]
+    assert wire.sent == [
+        MODBUS_FIFTY[framing],
+        forward,
+        forward,
+        MODBUS_REVERSE[framing],
+        MODBUS_STOP[framing],
+    ]
+
+
+def test_delixi_jog_sends_the_control_word_of_its_direction() -> None:
+    jogs = [
+        frame(DelixiModbus(1), DelixiModbus.control, word)
+        for word in (DelixiModbusControl.JOG_FORWARD, DelixiModbusControl.JOG_REVERSE)
+    ]
+    wire = Wire(DelixiModbus(1), MODBUS_STANDING, turns=dict.fromkeys(jogs, MODBUS_TURNING))
+    wire.drive.jog()
+    for direction in Direction:
+        with pytest.raises(
+            WriteForbidden, match=r"turns, and may continue to turn during a jog: call stop\(\) first"
+        ):
+            wire.drive.jog(direction)
+    wire.say(MODBUS_STANDING)
+    wire.drive.jog(Direction.REVERSE)
+    assert [each[:17] for each in wire.sent] == ["01 06 20 00 00 13", "01 06 20 00 00 23"]
+
+
+@table("name", ["start", "jog"])
+def test_delixi_start_is_unconfirmed_if_the_motor_does_not_run(name: str) -> None:
+    wire = Wire(DelixiModbus(1), MODBUS_STANDING)
+    with pytest.raises(Unconfirmed, match="it is not seen to run; stop it, or it may start later"):
+        getattr(wire.drive, name)()
+    assert len(wire.sent) == 1
+
+
+def test_delixi_start_of_a_turning_motor_without_a_direction_is_refused() -> None:
+    wire = Wire(DelixiModbus(1), {**MODBUS_STANDING, **MODBUS_TURNING})
+    with pytest.raises(WriteForbidden, match="give the direction"):
+        wire.drive.start()
+    assert wire.sent == []
+    wire.drive.start(Direction.FORWARD)
+    assert wire.sent == [MODBUS_FORWARD[Framing.RTU]]
+
+
+def test_delixi_stop_waits_for_0_hz_and_raises_if_it_does_not_come() -> None:
+    wire = Wire(DelixiModbus(1), {"output_frequency": [30.0, 10.0, 0.0]})
+    wire.drive.stop()
+    assert len(wire.reads) == 3
+    wire = Wire(DelixiModbus(1, stop_time=30), {"output_frequency": 5.0})
+    with pytest.raises(Unconfirmed, match="30 s"):
+        wire.drive.stop()
+    assert wire.sent == [MODBUS_STOP[Framing.RTU]]
+
+
+def test_delixi_setpoint_write_wears_eeprom_and_a_wrong_value_is_reported() -> None:
+    assert DelixiModbus.frequency.kept is Kept.EEPROM
+    assert "EEPROM" in DelixiModbus.frequency.note
+    wire = Wire(DelixiModbus(1), {"frequency": 40.0})
+    with pytest.raises(NotVerified, match=r"holds 40\.00 Hz"):
+        wire.drive.set_frequency(50)
+
+
+@table(
+    ("says", "state"),
+    [
+        ({"fault": DelixiFault.NONE, "output_frequency": 12.0}, State(Condition.RUNNING)),
+        ({"fault": DelixiFault.OH_OVERHEAT}, State(Condition.FAULT, fault="overheat (OH)")),
+        ({"fault": 99}, State(Condition.FAULT, fault="99")),
+    ],
+)
+def test_delixi_state_shows_the_fault_or_that_the_motor_turns(says: dict[str, object], state: State) -> None:
+    assert Wire(DelixiModbus(1), says).drive.state() == state
+
+
+def test_delixi_state_at_0_hz_is_unknown() -> None:
+    assert Wire(DelixiModbus(1), MODBUS_STANDING).drive.state().condition is Condition.UNKNOWN
+
+
+def test_delixi_identify_checks_address_and_baud_rate() -> None:
+    Wire(DelixiModbus(1), MODBUS_STANDING).drive.identify()
+    for name, other, sentence in (
+        ("fault", 99, "0063H"),
+        ("address_setting", 2, r"P04\.30"),
+        ("baudrate_setting", DelixiBaudrate.B1200, r"P04\.28"),
+    ):
+        with pytest.raises(WriteForbidden, match=sentence):
+            Wire(DelixiModbus(1), {**MODBUS_STANDING, name: other}).drive.identify()
+
+
+@table(
+    ("name", "held", "sentence"),
+    [
+        ("run_source", DelixiRunSource.KEYPAD, r"P00\.00 must be 2"),
+        ("frequency_source", 0, r"P00\.01"),
+        ("fault", DelixiFault.OH_OVERHEAT, "overheat"),
+        ("frequency", 0.0, "set_frequency"),
+    ],
+)
+def test_delixi_start_needs_line_control_and_no_fault(name: str, held: float, sentence: str) -> None:
+    wire = Wire(DelixiModbus(1), {**MODBUS_STANDING, name: held})
+    with pytest.raises(WriteForbidden, match=sentence):
+        wire.drive.start()
+    assert wire.sent == []
+
+
+# ---- Delixi's own protocol ----
+
+
+NATIVE_FORWARD = ":010200020000000005"  # printed in the document
+NATIVE_FIFTY = ":0104000100001388A1"  # printed in the document
+NATIVE_FIFTY_STORED = ":0106000200001388A4"  # printed in the document
+NATIVE_STOP = ":010200010000000004"
+NATIVE_REVERSE = ":010200030000000006"
+NATIVE_RESET = ":010200040000000007"
+
+NATIVE_STANDING = {
     "status": DelixiNativeStatus.STOPPED,
     "output_frequency": 0.0,
     "fault": DelixiFault.NONE,
@@ -39,13 +240,13 @@ STANDING = {
     "address_setting": 1,
     "baudrate_setting": DelixiBaudrate.B9600,
 }
-TURNS = {
-    FORWARD: {"status": DelixiNativeStatus.FORWARD, "output_frequency": 9.0},
-    REVERSE: {"status": DelixiNativeStatus.REVERSE, "output_frequency": 9.0},
-    STOP: {"status": DelixiNativeStatus.STOPPED, "output_frequency": 0.0},
+NATIVE_TURNS = {
+    NATIVE_FORWARD: {"status": DelixiNativeStatus.FORWARD, "output_frequency": 9.0},
+    NATIVE_REVERSE: {"status": DelixiNativeStatus.REVERSE, "output_frequency": 9.0},
+    NATIVE_STOP: {"status": DelixiNativeStatus.STOPPED, "output_frequency": 0.0},
 }
 
-TABLE = """
+NATIVE_TABLE = """
 00/02 0000 control             - DelixiNativeControl
 03/00 0000 status              - DelixiNativeStatus
 00/04 0001 frequency        0.01 Hz
@@ -57,7 +258,7 @@ TABLE = """
 def test_delixi_native_registers_equal_the_tables_of_the_document() -> None:
     own = DELIXI_MONITORS.replace("DelixiModbusFormat", "DelixiNativeFormat")
     shared = "\n".join(f"07/06 {line}" for line in own.strip().splitlines())
-    assert rows(DelixiNative) == typed(TABLE + shared)
+    assert rows(DelixiNative) == typed(NATIVE_TABLE + shared)
 
 
 def test_delixi_registers_of_each_function_code_have_the_documented_size() -> None:
@@ -87,25 +288,25 @@ def test_delixi_native_broadcasts_only_a_stop_command() -> None:
 
 
 def test_each_delixi_native_verb_sends_the_printed_frame() -> None:
-    wire = Wire(DelixiNative(1), STANDING, turns=TURNS)
+    wire = Wire(DelixiNative(1), NATIVE_STANDING, turns=NATIVE_TURNS)
     wire.drive.set_frequency(50)
     wire.drive.start()
     wire.drive.start(Direction.REVERSE)
     wire.drive.stop()
     wire.drive.reset_fault()
-    assert wire.sent == [FIFTY, FORWARD, REVERSE, STOP, RESET]
+    assert wire.sent == [NATIVE_FIFTY, NATIVE_FORWARD, NATIVE_REVERSE, NATIVE_STOP, NATIVE_RESET]
 
 
 def test_delixi_native_start_keeps_a_running_motors_direction_by_default() -> None:
-    wire = Wire(DelixiNative(1), {**STANDING, **TURNS[REVERSE]}, turns=TURNS)
+    wire = Wire(DelixiNative(1), {**NATIVE_STANDING, **NATIVE_TURNS[NATIVE_REVERSE]}, turns=NATIVE_TURNS)
     wire.drive.set_frequency(50)
     wire.drive.start()
     wire.drive.start(Direction.FORWARD)
-    assert wire.sent == [FIFTY, REVERSE, FORWARD]
+    assert wire.sent == [NATIVE_FIFTY, NATIVE_REVERSE, NATIVE_FORWARD]
 
 
 def test_delixi_native_start_without_a_known_setpoint_is_refused() -> None:
-    wire = Wire(DelixiNative(1), STANDING)
+    wire = Wire(DelixiNative(1), NATIVE_STANDING)
     with pytest.raises(WriteForbidden, match="set_frequency"):
         wire.drive.start()
     assert wire.sent == []
@@ -121,12 +322,12 @@ def test_delixi_native_start_without_a_known_setpoint_is_refused() -> None:
 )
 def test_delixi_native_start_is_refused_if_the_motor_could_start_later(status: int, sentence: str) -> None:
     """P05.31 shows no fault here. A run command without mains voltage may take effect later."""
-    wire = Wire(DelixiNative(1), {**STANDING, "status": status})
+    wire = Wire(DelixiNative(1), {**NATIVE_STANDING, "status": status})
     wire.drive.set_frequency(50)
     for direction in (None, *Direction):
         with pytest.raises(WriteForbidden, match=sentence):
             wire.drive.start(direction)
-    assert wire.sent == [FIFTY]
+    assert wire.sent == [NATIVE_FIFTY]
 
 
 @table(
@@ -137,24 +338,24 @@ def test_delixi_native_start_is_refused_if_the_motor_could_start_later(status: i
     ],
 )
 def test_delixi_native_start_needs_line_control_and_no_fault(says: dict[str, object], sentence: str) -> None:
-    wire = Wire(DelixiNative(1), STANDING | says, turns=TURNS)
+    wire = Wire(DelixiNative(1), NATIVE_STANDING | says, turns=NATIVE_TURNS)
     wire.drive.set_frequency(50)
     with pytest.raises(WriteForbidden, match=sentence):
         wire.drive.start()
-    assert wire.sent == [FIFTY]
+    assert wire.sent == [NATIVE_FIFTY]
 
 
 def test_delixi_native_start_is_unconfirmed_if_the_motor_is_not_seen_to_run() -> None:
-    wire = Wire(DelixiNative(1), STANDING)
+    wire = Wire(DelixiNative(1), NATIVE_STANDING)
     wire.drive.set_frequency(50)
     with pytest.raises(Unconfirmed, match="it is not seen to run; stop it, or it may start later"):
         wire.drive.start()
-    assert wire.sent == [FIFTY, FORWARD]
+    assert wire.sent == [NATIVE_FIFTY, NATIVE_FORWARD]
 
 
 def test_delixi_setpoint_in_eeprom_is_written_with_function_06() -> None:
     drive = DelixiNative(1)
-    assert frame(drive, DelixiNative.stored_frequency, 50) == FIFTY_STORED
+    assert frame(drive, DelixiNative.stored_frequency, 50) == NATIVE_FIFTY_STORED
     assert DelixiNative.stored_frequency.kept is Kept.EEPROM
     assert DelixiNative.frequency.kept is Kept.RAM
 
@@ -196,7 +397,7 @@ def test_delixi_fault_codes_may_be_decimal_or_hex_digits(raw: int, fault: int) -
 @table(
     ("says", "state"),
     [
-        (STANDING, State(Condition.STOPPED)),
+        (NATIVE_STANDING, State(Condition.STOPPED)),
         (
             {"status": DelixiNativeStatus.FORWARD, "output_frequency": 9.0},
             State(Condition.RUNNING, Direction.FORWARD),
@@ -226,13 +427,13 @@ def test_delixi_native_state_shows_run_direction_and_fault(says: dict[str, objec
 
 
 def test_delixi_native_identify_reads_address_and_baud_rate() -> None:
-    wire = Wire(DelixiNative(1), STANDING)
+    wire = Wire(DelixiNative(1), NATIVE_STANDING)
     wire.drive.identify()
     assert (wire.reads, wire.sent) == (["address_setting", "baudrate_setting"], [])
     with pytest.raises(NoReply):
         Wire(DelixiNative(1), {"address_setting": NoReply("drive")}).drive.identify()
     with pytest.raises(WriteForbidden, match=r"P04\.30"):
-        Wire(DelixiNative(2), STANDING).drive.identify()
+        Wire(DelixiNative(2), NATIVE_STANDING).drive.identify()
 
 
 def test_delixi_subclass_keeps_the_registers_and_adds_its_own() -> None:
@@ -281,10 +482,10 @@ def test_delixi_writes_to_eeprom_are_limited_and_writes_to_ram_are_not(tmp_path:
 
 @table("status", [DelixiNativeStatus.FAULT, DelixiNativeStatus.UNDERVOLTAGE])
 def test_delixi_fault_that_remains_after_a_reset_is_reported(status: DelixiNativeStatus) -> None:
-    wire = Wire(DelixiNative(1), {**STANDING, "status": status, "fault": DelixiFault.OC_OVERCURRENT})
+    wire = Wire(DelixiNative(1), {**NATIVE_STANDING, "status": status, "fault": DelixiFault.OC_OVERCURRENT})
     with pytest.raises(NotVerified, match=r"the fault reset.*the fault remains: overcurrent"):
         wire.drive.reset_fault()
-    assert wire.sent == [RESET]  # sent once
+    assert wire.sent == [NATIVE_RESET]  # sent once
 
 
 @table(
@@ -296,7 +497,7 @@ def test_delixi_fault_that_remains_after_a_reset_is_reported(status: DelixiNativ
     ],
 )
 def test_delixi_reset_is_refused_while_the_motor_turns(status: DelixiNativeStatus, hz: float) -> None:
-    wire = Wire(DelixiNative(1), {**STANDING, "status": status, "output_frequency": hz})
+    wire = Wire(DelixiNative(1), {**NATIVE_STANDING, "status": status, "output_frequency": hz})
     with pytest.raises(WriteForbidden, match="runs: it has no fault to reset"):
         wire.drive.reset_fault()
     assert wire.sent == []
