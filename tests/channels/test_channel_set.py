@@ -181,7 +181,7 @@ def test_reload_of_the_plant_continues_totals_without_an_outage() -> None:
     assert second.outages == []
 
 
-def test_total_has_an_outage_if_another_drive_takes_over_the_name() -> None:
+def test_an_integral_skips_the_time_between_two_drives_of_one_name() -> None:
     ratio = Channel("ratio", "power / 2", "kW")
     energy, change = (
         Channel("energy", "integral(ratio)", "kW*s"),
@@ -283,7 +283,7 @@ def test_a_sleep_of_the_computer_is_an_outage(batches: int) -> None:
         (1.0, 0.0),
         (2.0, 0.0),
     ]
-    # the other register was read too long ago until it is read again
+    # the sum is OLD after the sleep until the register `other` is read again
     assert [(one.status, one.value) for one in sums][-2:] == [(OLD, 0.0), (0, 7202.0)]
 
 

@@ -211,7 +211,7 @@ class Scattered(Drive):
     st.floats(0, 0.2),
     st.floats(0, 1),
 )
-def test_read_plan_is_the_quickest_exactly_at_the_delays_that_it_states(
+def test_a_plan_is_the_quickest_only_within_its_range_of_response_delays(
     wanted: set[Register[float]], baudrate: int, framing: Framing, delay: float, part: float
 ) -> None:
     drive = Scattered(1, baudrate=baudrate, framing=framing)
@@ -233,7 +233,7 @@ def test_read_plan_is_the_quickest_exactly_at_the_delays_that_it_states(
             assert excess(outside) > 1e-6
 
 
-def test_plan_of_several_polling_rates_states_the_delays_at_which_all_are_quickest() -> None:
+def test_a_plan_for_several_rates_has_their_common_range_of_delays() -> None:
     drive = Scattered(1, baudrate=9600)
     rates = {0.1: [Scattered.r0, Scattered.r2], None: [Scattered.r3, Scattered.r5]}
     apart = [

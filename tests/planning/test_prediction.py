@@ -47,7 +47,7 @@ class Simple(Drive):
     d = reading(12)
 
 
-# s of one exchange: request and reply of two registers in 8N1, and the response delay
+# duration of one exchange in s: request and reply of two registers in 8N1, and the response delay
 OWN = (8 + 9) * 10 * BIT + 4e-3
 SILENCE = 3.5 * 10 * BIT + BIT
 
@@ -337,7 +337,7 @@ def test_readable_gaps_would_save_a_fifth_of_a_meters_reading_time() -> None:
     assert reading_gain(told, [(told.register(name), None) for name in ADDRESSES]) is None
 
 
-def test_suggestion_for_a_family_file_uses_its_notation(tmp_path: Path) -> None:
+def test_readable_gaps_for_a_family_file_are_suggested_in_toml(tmp_path: Path) -> None:
     source = (
         "[family]\ntitle = 'Meter'\nmanual = 'of this test'\ncounts_from = 0\n[reading]\n"
         "low = { at = 1, unit = 'V' }\nhigh = { at = 3, unit = 'V' }\n"
@@ -363,7 +363,7 @@ def test_readable_gaps_are_not_suggested_if_declared_or_useless() -> None:
         assert reading_gain(drive, [(register, None) for register in drive.readings()]) is None
 
 
-def test_stated_read_limit_bounds_the_gain_of_readable_gaps() -> None:
+def test_suggested_reads_do_not_exceed_the_read_limit_of_the_class() -> None:
     class Limited(Drive):
         most_registers = {HOLDING: 3}
         a = reading(1)
@@ -376,7 +376,7 @@ def test_stated_read_limit_bounds_the_gain_of_readable_gaps() -> None:
     assert [len(gap) for _, gap in gain.gaps] == [1]
 
 
-def test_commands_plan_and_models_suggest_readable_gaps_only_for_a_users_class(
+def test_readable_gaps_are_suggested_only_for_a_users_own_class(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     plant = tmp_path / "hall.toml"
@@ -395,7 +395,7 @@ def test_commands_plan_and_models_suggest_readable_gaps_only_for_a_users_class(
         main(["models", model])
         told = " ".join(capsys.readouterr().out.split())
         assert "readable_gaps" not in told
-        # the documents of some families in files state no limit
+        # only shipped family files may state no limit, because some documents state none
         assert "the family states none" not in told or model in SHIPPED
 
 

@@ -241,7 +241,7 @@ def test_one_register_of_a_group_can_be_read_without_the_others() -> None:
     assert [(one.block.start, one.block.count) for one in planned(Grouped(1), rates)] == [(0, 1), (60, 1)]
 
 
-def test_read_together_groups_are_read_before_other_registers() -> None:
+def test_groups_in_read_together_come_before_other_registers() -> None:
     order = [block.registers[0].name for block in blocks(Grouped(1), Grouped.registers.values())]
     assert order[:2] == ["latch", "energy_high"]
     assert order[-1] == "other"

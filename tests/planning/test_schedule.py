@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from multidrop.planning.schedule import FIRST_REST_NS, LONGEST_REST_NS, TURN_SHARE, Job, Schedule
+from multidrop.planning.schedule import FIRST_PAUSE_NS, LONGEST_PAUSE_NS, TURN_SHARE, Job, Schedule
 
 MS = 1_000_000
 
@@ -141,7 +141,7 @@ def test_poll_whose_slot_ends_soon_goes_before_polls_with_the_same_settings() ->
     assert one.skipped == 0
 
 
-def test_no_poll_without_a_period_gets_a_second_turn_while_others_wait() -> None:
+def test_polls_without_a_period_are_sent_one_after_another() -> None:
     jobs = [job(drive) for drive in range(5)]
     made = schedule(*jobs)
     assert [each for each, _ in take(made, 0, 35)] == [*jobs, *jobs[:2]]
@@ -205,9 +205,9 @@ def test_silent_drive_is_asked_less_often_each_time_while_others_are_polled() ->
         rests.append(woken - now)
         now = woken
         fail(made, 1, failures, now)
-    assert FIRST_REST_NS // MS <= rests[0] <= FIRST_REST_NS // MS + 100
+    assert FIRST_PAUSE_NS // MS <= rests[0] <= FIRST_PAUSE_NS // MS + 100
     assert rests == sorted(rests)
-    assert LONGEST_REST_NS // MS <= rests[-1] <= LONGEST_REST_NS // MS + 100
+    assert LONGEST_PAUSE_NS // MS <= rests[-1] <= LONGEST_PAUSE_NS // MS + 100
 
 
 def test_silent_drive_is_asked_again_exactly_when_its_pause_ends() -> None:
@@ -220,7 +220,7 @@ def test_silent_drive_is_asked_again_exactly_when_its_pause_ends() -> None:
         assert [each for each, _, _ in made.take(at, at, at + 1, 9)] == [dead]
 
 
-def test_only_the_first_pause_of_a_drive_is_short_if_timeouts_take_much_time() -> None:
+def test_a_drive_with_long_timeouts_has_only_one_short_pause() -> None:
     made = schedule(lossy := job(1))
     for failures, at_ms, rest_ms in ((2, 0, 500), (3, 500, 20_000)):
         made.back_off.observe(1, failures, at_ms * MS, late_until_ns=0, cost_ns=300 * MS)
@@ -328,7 +328,7 @@ def test_silent_drive_is_tried_once_after_its_late_reply() -> None:
     assert [each for each, _ in take(made, 100, 60)].count(poll) == 1
 
 
-def test_polls_with_the_present_line_settings_go_first_only_if_all_fit_in_time() -> None:
+def test_polls_with_the_present_line_settings_go_first_if_no_slot_is_missed() -> None:
     """If the time is a nanosecond too short, the job whose slot ends first is sent first."""
     for less, order in ((0, [2, 1]), (1, [1, 2])):
         made = schedule(job(3, 1000, 10, kind=2))
@@ -338,10 +338,10 @@ def test_polls_with_the_present_line_settings_go_first_only_if_all_fit_in_time()
         assert [each.drive for each, _ in take(made, 10, 1 + 19)] == order
 
 
-def test_poll_whose_slot_ends_first_goes_first_after_a_delay_is_made_up() -> None:
+def test_the_most_urgent_poll_goes_first_again_after_a_delay() -> None:
     made = schedule(quick := job(1, 10, 2), slow := job(2, 1000, 2), middling := job(3, 100, 2))
     take(made, 0, 1, most=3)
-    taken = take(made, 1000, 1010)  # the slots of the quick job are over
+    taken = take(made, 1000, 1010)  # the quick job's slots of the last second have ended
     assert [each for each, due in taken if due >= 2000] == [quick, middling, slow]
 
 
@@ -354,7 +354,7 @@ def test_due_poll_is_skipped_if_its_drive_falls_silent() -> None:
     assert {each for each, _ in take(made, 100, 20)} == {one, two}
 
 
-def test_poll_of_a_drive_that_gets_no_request_loses_its_turn() -> None:
+def test_a_paused_drive_is_left_out_of_the_round() -> None:
     made = schedule(*(jobs := [job(drive, None, 10) for drive in range(3)]))
     fail(made, 1, 1, now_ms=0, late_until_ms=10_000)
     assert [each for each, _ in take(made, 0, 40)] == [jobs[0], jobs[2], jobs[0], jobs[2]]
@@ -389,25 +389,25 @@ def test_polls_of_a_silent_drive_are_reported_with_the_time_they_were_due() -> N
     assert made.unasked == [(poll, due * MS) for due in (0, 100, 200, 300)]
 
 
-def test_poll_without_a_period_is_reported_once_per_pause_of_its_drive() -> None:
+def test_a_pause_reports_a_poll_without_a_period_once() -> None:
     made = schedule(poll := job(1), job(2))
     fail(made, 1, 2, now_ms=7)
     take(made, 8, 300)
     assert made.unasked == [(poll, 7 * MS)]
 
 
-def test_pass_all_returns_every_due_poll_and_every_poll_without_a_period() -> None:
+def test_skipping_everything_returns_polls_without_a_period_too() -> None:
     made = schedule(poll := job(1, period_ms=100), fast := job(2))
     assert made.pass_all(150 * MS) == [(fast, 150 * MS), (poll, 0), (poll, 100 * MS)]
 
 
-def test_pass_slots_returns_the_due_polls_that_were_not_requested() -> None:
+def test_skipped_slots_are_those_that_were_due_but_not_requested() -> None:
     made = schedule(poll := job(1, period_ms=100), job(2))
     take(made, 0, 50)
     assert made.pass_slots(250 * MS) == [(poll, 100 * MS), (poll, 200 * MS)]
 
 
-def test_pass_slots_includes_polls_that_are_due_now_or_were_started() -> None:
+def test_skipped_slots_include_polls_that_are_due_now_or_were_started() -> None:
     made = schedule(one := job(1, 100), two := job(2, 100), begun := job(3, 1000))
     assert [each for each, _ in take(made, 0, 100, most=2)] == [one, two]
     assert made.pass_slots(100 * MS) == [(begun, 0), (one, 100 * MS), (two, 100 * MS)]
@@ -452,14 +452,14 @@ def test_a_new_order_of_drives_starts_a_new_round() -> None:
     assert [asked for asked, _ in take(made, 100, 15)] == [jobs[2], jobs[1], jobs[0]]
 
 
-def test_replacement_of_a_poll_without_a_period_takes_its_turn() -> None:
+def test_a_poll_without_a_period_gets_the_turn_of_the_poll_it_replaces() -> None:
     made = schedule(*(jobs := [job(drive) for drive in range(3)]))
     assert take(made, 0, 1) == [(jobs[0], 0)]
     made.replace(jobs[1:2], [new := job(1)], 0)
     assert [asked for asked, _ in take(made, 100, 15)] == [new, jobs[2], jobs[0]]
 
 
-def test_cycle_returns_polls_only_if_all_drives_answer_and_none_has_a_period() -> None:
+def test_a_repeatable_cycle_needs_answering_drives_and_no_periods() -> None:
     made = schedule(one := job(1), two := job(2))
     assert made.cycle(0) == [one, two]
     fail(made, 1, 0, now_ms=0)
@@ -512,8 +512,8 @@ def test_polls_neither_drift_nor_pile_up_after_stalls(
 def test_every_poll_gets_turns_on_any_overloaded_line(kinds: list[tuple[int, int | None, int, int]]) -> None:
     made = schedule(*(job(*kind) for kind in kinds))
     done = carry_out(made, 3)
-    # A job waits at most for one request of each other job, for the share of jobs without a period, and for a
-    # few rounds of jobs with its line settings.
+    # The limit is the sum of three waits: for one request of each other job, for jobs without a period, and
+    # for jobs with the present line settings.
     longest = 80 * MS + 8 * 10 * MS / TURN_SHARE + 1000 * MS
     for each in made.jobs:
         sent = [0, *(at for other, _, at in done if other is each), 3000 * MS]
@@ -606,7 +606,7 @@ class Operation(RuleBasedStateMachine):
             assert each in self.made.jobs
             # No request is sent while a late reply may come, even if the line is ready earlier.
             assert max(self.now, not_before) >= self.silent_until[each.drive]
-            if each.period_ns and due is None:  # a request that tries a silent drive, outside the slots
+            if each.period_ns and due is None:  # a retry of a silent drive uses no slot
                 assert self.failures[each.drive] >= 2
             elif each.period_ns:
                 # slots start at each multiple of the period
@@ -721,7 +721,7 @@ def test_new_drive_that_does_not_reply_gets_no_more_requests_for_a_while() -> No
     answer(made, living, 1)
     made.back_off.conclude(dead.drive)
     made.back_off.observe(1, 1, 60 * MS, late_until_ns=0, cost_ns=450 * MS, has_answered=False)
-    rest_ms = 30_000  # 450 ms of requests are 1.5 % of this pause, the share of silent drives
+    rest_ms = 30_000  # a request of 450 ms takes the share SILENT_SHARE, 1.5 %, of this pause
     assert {asked for asked, _ in take(made, 60, rest_ms)} == {living}
     assert made.unasked == [(dead, 60 * MS)]
     assert take(made, 60 + rest_ms, 1) == [(dead, 0)]
@@ -747,7 +747,7 @@ def test_few_silent_new_drives_get_a_second_request_immediately() -> None:
         assert lost not in {asked for asked, _ in take(made, 230, 20)}
 
 
-def test_drive_whose_pause_ends_first_is_tried_when_another_answers_again() -> None:
+def test_a_returning_drive_ends_the_pause_that_would_end_next() -> None:
     made = schedule(*(jobs := [job(drive) for drive in range(3)]))
     fail(made, 0, 2, 0, late_until_ms=300)
     fail(made, 1, 2, 100)
@@ -776,7 +776,7 @@ def plans(made: Schedule[Job]) -> list[list[tuple[Job, int, int | None]]]:
     return [[*made.take(at * MS, at * MS, until * MS, 9)] for at, until in ((0, 12), (12, 60))]
 
 
-def test_turns_put_back_are_planned_again_with_their_slots_and_in_their_order() -> None:
+def test_unsent_turns_are_planned_again_in_the_same_slots_and_order() -> None:
     made = schedule(job(1, 40), job(2), job(3, 60), job(4))
     before = plans(made)
     assert [len(plan) for plan in before] == [3, 9]

@@ -171,7 +171,7 @@ address = 3
 """
 
 
-def test_silence_of_a_line_replaces_t3_5_but_no_longer_silence_of_a_family(load: Load) -> None:
+def test_silence_of_a_line_replaces_t3_5_but_not_a_longer_family_silence(load: Load) -> None:
     (line,) = load(SILENT).lines
     assert [polled.drive.needed_silence() for polled in line.drives] == pytest.approx([500e-6, 10e-3, 0])
     assert line.switching == 0
@@ -595,7 +595,7 @@ def test_invalid_durations_in_a_plant_file_are_refused(text: str) -> None:
         parse_duration(text)
 
 
-def test_keys_ram_and_confirmed_of_a_plant_file_reach_the_drive(tmp_path: Path) -> None:
+def test_a_drive_gets_its_ram_and_confirmed_keys_from_the_plant_file(tmp_path: Path) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(
         """

@@ -168,7 +168,7 @@ b = 1
         (["line", "drive", ("poll", 2)], "", 9),
         (["line", "drive", ("poll", 2)], "every", 9),
         (["line", "drive", ("poll", 3)], "", 10),
-        # the drive has no key `poll`, so the line number of the list is used
+        # `poll` has no fourth table, so the line number of the key `poll` is used
         (["line", "drive", ("poll", 4)], "", 6),
         (["line", "drive"], "address", 16),
         ([("line", 2)], "name", 18),

@@ -348,8 +348,7 @@ def test_rows_have_the_time_of_their_exchange_although_the_computer_slept(tmp_pa
             check=False,
         )
     assert ran.returncode == 0, ran.stderr
-    # hours by which the rows' UTC is ahead of a clock that stops during sleep: for requests before the sleep
-    # (True) and after it (False)
+    # growth of UTC minus monotonic time, in hours: in rows before the sleep (True) and after it (False)
     slept_for = {True: set[int](), False: set[int]()}
     # the request at `unsure_ns` may be before or after the sleep
     before_ns, unsure_ns = asked_ns[48], asked_ns[49]

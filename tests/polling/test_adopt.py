@@ -276,7 +276,7 @@ def calls_to_add_one_to(count: int) -> int:
 
     with clocked(*lines) as made:
         sys.setprofile(note)
-        threading.setprofile(note)  # also counts calls in the thread that adopts
+        threading.setprofile(note)  # also counts calls in threads that `adopt` starts
         try:
             made.poller.adopt(plant(*lines, yard(*fans())))
         finally:
@@ -306,7 +306,7 @@ def test_late_replies_are_still_expected_after_adopt_reopens_a_port() -> None:
         check_rates(made, pump_1=0.1)
 
 
-def test_a_replacing_drive_expects_late_replies_to_the_replaced_drive() -> None:
+def test_a_new_drive_expects_late_replies_of_the_drive_that_it_replaces() -> None:
     """The old drive's queued requests are sent first. The new drive then knows which late replies are due."""
     wires = {"port of hall": wire(Toy(1))}
     with ClockedLines.of_lines(wires, plant(hall(toy("pump-1", 1), toy("deaf", 5, 0.05)))) as made:
@@ -432,7 +432,7 @@ def test_adopting_drives_of_another_open_poller_raises() -> None:
         assert list(made.poller.buses) == ["hall"]
 
 
-def test_adopting_more_names_than_a_batch_has_codes_raises() -> None:
+def test_adopt_refuses_more_drive_names_than_a_batch_can_number() -> None:
     with clocked(hall(*pumps())) as made:
         for number in range(65534):
             made.poller._lines.names.drives.number(f"gone-{number}")
@@ -461,7 +461,7 @@ def test_adopt_rejects_other_types() -> None:
     poller.close()
 
 
-def test_polled_since_separates_the_rows_of_two_drives_with_one_name() -> None:
+def test_rows_of_drives_that_swap_their_names_are_distinguished_by_time() -> None:
     """Three drives on two lines swap their names. Each drive has a different value."""
     wires = {"port of hall": toys(), "port of yard": wire(*(Toy(address) for address in (5, 6)))}
 
@@ -513,7 +513,7 @@ def test_a_new_drive_with_a_used_name_has_its_own_statistics() -> None:
 
 
 @pytest.mark.slow
-def test_a_drive_name_has_the_same_code_in_all_batches() -> None:
+def test_all_batches_of_a_poller_use_one_code_for_a_drive_name() -> None:
     with clocked(hall(*pumps())) as made:
         made.run(1)
         meant: dict[int, str] = {}
@@ -532,7 +532,7 @@ def test_a_drive_name_has_the_same_code_in_all_batches() -> None:
 
 
 @pytest.mark.long
-def test_memory_is_bounded_over_many_adoptions() -> None:
+def test_memory_stays_bounded_if_the_plant_changes_often() -> None:
     with clocked(hall(*pumps()), yard(*fans())) as made:
 
         def kept() -> tuple[int, ...]:

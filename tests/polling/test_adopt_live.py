@@ -149,7 +149,7 @@ def test_with_stop_on_exit_a_drive_is_stopped_before_it_is_removed(both: TwoLine
         assert not runs(both.fans[1])
         assert not runs(both.fans[2])
         poller.adopt(plant(both.hall(1), both.yard()))
-        poller.bus("yard").drives[0].start()  # on the line that was just added
+        poller.bus("yard").drives[0].start()  # `stop_on_exit` must apply to this new line too
     assert not runs(both.pumps[1])
     assert not runs(both.fans[1])
 
@@ -173,7 +173,9 @@ def test_a_drive_that_is_being_removed_cannot_be_started_after_its_stop(both: Tw
         assert not runs(both.pumps[2])
 
 
-def test_drives_on_an_opening_line_stop_at_exit(both: TwoLines, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stop_on_exit_applies_to_a_line_that_is_being_opened(
+    both: TwoLines, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with Poller(plant(both.hall())) as poller:
         with Blocked() as opening:
             monkeypatch.setattr(Bus, "__init__", opening.blocking(Bus.__init__))
@@ -206,7 +208,7 @@ def test_a_drive_of_a_changed_family_gets_no_stop_of_the_old_family(both: TwoLin
         assert writes == []
         assert runs(both.pumps[1])
         assert runs(both.fans[1])
-    assert not runs(both.pumps[1])  # the stop of the new family has stopped this motor at exit
+    assert not runs(both.pumps[1])  # stopped at exit, by the stop of its new family
     assert not runs(both.fans[1])
 
 
@@ -293,7 +295,7 @@ def test_replaced_drives_stay_attached_during_stops(both: TwoLines, monkeypatch:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("is_circle", [False, True])
-def test_a_drive_stays_attached_while_its_new_name_is_used_on_another_line(
+def test_a_drive_can_be_stopped_until_its_new_name_is_free(
     both: TwoLines, monkeypatch: pytest.MonkeyPatch, is_circle: bool
 ) -> None:
     """While the adoption waits for a stop on the other line, the drive's motor can still be stopped."""
@@ -320,7 +322,9 @@ def test_a_drive_stays_attached_while_its_new_name_is_used_on_another_line(
             until_sampled(poller, name)
 
 
-def test_a_stop_on_a_line_delays_no_change_of_others(both: TwoLines, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slow_stop_on_one_line_does_not_delay_changes_of_other_lines(
+    both: TwoLines, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with Poller(plant(both.hall(), both.yard())) as poller:
         bus = poller.bus("yard")
         with blocked_stop(bus, monkeypatch, bus.stop_all) as stopping:
@@ -399,7 +403,7 @@ def _is_asking(poller: Poller, of: PolledDrive) -> bool:
     return bus.is_asking(bus.peer(of.drive))
 
 
-def test_closing_a_poller_waits_for_adopt(both: TwoLines, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_poller_closes_only_after_adopt_has_ended(both: TwoLines, monkeypatch: pytest.MonkeyPatch) -> None:
     poller = Poller(plant(both.hall()))
     poller.__enter__()
     with Blocked() as opening:

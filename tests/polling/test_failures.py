@@ -111,7 +111,7 @@ def test_a_failure_on_one_line_does_not_affect_other_lines(
     method: str,
     failure: BaseException,
 ) -> None:
-    for name in ("RETRY_NS", "LONGEST_RETRY_NS"):  # long enough for a batch of misses before each retry
+    for name in ("RETRY_NS", "LONGEST_RETRY_NS"):  # before each retry, a batch without values must arrive
         monkeypatch.setattr(polled_line, name, 200_000_000)
     two.until(("ill", "ok"), ("well", "ok"))
     with monkeypatch.context() as broken:
@@ -128,7 +128,7 @@ def test_a_failure_on_one_line_does_not_affect_other_lines(
     assert two.poller.failure is None
 
 
-def test_a_line_that_works_again_leaves_line_failures(two: Two, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_recovered_line_is_removed_from_line_failures(two: Two, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as broken:
         broken.setattr(PortQueue, "keep_busy", of_line("ill", PortQueue.keep_busy, Ill()))
         two.until(("ill", FAILED))
@@ -210,7 +210,7 @@ def test_calls_of_a_failed_poller_raise_polling_failed(failed: Two, caplog: pyte
     poller = failed.poller
     assert repr(poller).startswith("<Poller polling has ended on all lines: Ill: of this line;")
     rows: list[Row] = []
-    with pytest.raises(PollingFailed) as raised:  # after the rows that were not taken yet
+    with pytest.raises(PollingFailed) as raised:  # only after all queued rows were taken
         rows.extend(row for batch in poller.batches() for row in batch)
     assert rows
     assert isinstance(raised.value.__cause__, Ill)
@@ -462,7 +462,7 @@ def test_on_batch_errors_are_logged_and_raised_once(poller: Poller, caplog: pyte
     (record,) = caplog.records
     assert record.getMessage() == "on_batch: the function failed and is no longer called"
     left = rows_of(poller)
-    assert calls[0] + len(left) == counted(poller)  # all rows after the failure
+    assert calls[0] + len(left) == counted(poller)  # no row was lost by the failure
     poller.close()  # the failure is raised only once
 
 

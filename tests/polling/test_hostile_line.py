@@ -121,8 +121,8 @@ def test_a_delixi_reply_equal_to_its_request_is_not_taken_for_an_echo(register: 
 
 
 @pytest.mark.story
-def test_an_echo_of_a_silent_delixi_drive_is_not_read_as_0_for_long() -> None:
-    """A broken wire may silence a drive and echo requests. After two echoes, a request detects it."""
+def test_only_two_echoes_of_a_silent_delixi_drive_are_read_as_0() -> None:
+    """A broken wire may silence a drive and echo requests. The third read shows it: its reply must differ."""
     drive = DelixiNative(1, name="drive-1")
     asked = polled(drive, [DelixiNative.output_frequency, DelixiNative.output_current])
     wire = ClockedWire([simulated(drive)], Faults())
@@ -316,7 +316,8 @@ def test_a_lost_request_does_not_slow_a_drive_permanently(lost: int) -> None:
     assert wire.unanswered == 0
 
 
-def test_wrong_known_counts_do_not_end_polling_after_a_lost_request() -> None:
+def test_polling_continues_after_a_lost_request_if_known_counts_are_wrong() -> None:
+    """No reply has the raw counts that the family's class states for its registers."""
     pump = MisprintedToy(1, name="pump")
     sim = SimulatedDrive(pump)
     sim["mystery"], sim["acceleration_time"] = 1234, 123.4

@@ -29,7 +29,7 @@ from toy import Toy
 from multidrop import Bus, InvtCHE, Poller
 from multidrop.sim import EncodedDrive, MotorDrive, Simulator, Wire, simulated
 
-# The warnings come from garbage collections, which may be interrupted too.
+# An interrupted garbage collection gives this warning.
 pytestmark = [patient, pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")]
 
 CURRENT = Toy.registers["output_current"]

@@ -117,7 +117,7 @@ def test_a_stop_is_the_first_request_to_its_drive_after_the_least_interval() -> 
     assert sim.early == 0
 
 
-def test_reads_with_bus_keep_the_least_interval() -> None:
+def test_single_reads_keep_the_least_interval_between_requests() -> None:
     (drive, sim), (other, its_sim) = slow(), quick(2)
     with ClockedLines(ClockedWire([sim, its_sim], Faults()), [polled(other, other.readings())]) as clocked:
         bus = clocked.poller.bus("line")
@@ -145,7 +145,7 @@ def test_the_least_interval_extends_the_expiry_of_a_write() -> None:
 
 
 @pytest.mark.slow
-def test_the_predicted_rate_includes_the_least_interval() -> None:
+def test_the_predicted_rate_includes_the_interval_between_requests() -> None:
     drive, sim = slow()
     wanted = planned(drive, [(register, None) for register in drive.readings()])
     found = predict(wanted, lateness=0.0)
@@ -196,7 +196,7 @@ def test_a_schedule_has_no_cycle_while_a_drive_has_a_least_interval() -> None:
     assert schedule.cycle(0) == [other]
 
 
-def test_after_a_least_interval_only_jobs_that_were_not_removed_are_sent() -> None:
+def test_a_removed_job_is_not_sent_after_its_drives_interval() -> None:
     schedule: Schedule[Job] = Schedule()
     other = Job(drive=2, period_ns=None, duration_ns=10)
     first, second = (Job(drive=1, period_ns=None, duration_ns=10, interval_ns=1000) for _ in range(2))
@@ -211,7 +211,7 @@ def test_after_a_least_interval_only_jobs_that_were_not_removed_are_sent() -> No
     assert schedule.take(4020, 4020, 5000, 9) == []  # the interval ends now, but the drive is silent
 
 
-def test_the_next_job_is_planned_for_the_first_end_of_a_least_interval() -> None:
+def test_the_drive_whose_interval_ends_first_gets_the_next_request() -> None:
     schedule: Schedule[Job] = Schedule()
     slow, fast = (
         Job(drive=drive, period_ns=None, duration_ns=10, interval_ns=1000 // drive) for drive in (1, 2)

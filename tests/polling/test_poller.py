@@ -334,7 +334,7 @@ def test_each_fault_of_a_reply_gives_rows_with_its_status(fault: str, pump: Simu
     # A socket, because a pty's buffer is too small for the noise.
     wire = Faulty([pump], fate, unpaced=True, port="socket://127.0.0.1:0")
     with Simulator([wire]) as sim, Polling(line(sim.wires[0].path, polled(drive(), ONE))) as polling:
-        # all rows since the start count: after three refusals, a block is requested only once a minute
+        # counts all rows since the start: after three refusals, polling continues only once a minute
         until(lambda: all(polling.statuses()[status] >= 2 for status in said))
     assert {row.value for row in polling.rows if row.status == "ok"} == ({3.25} if "ok" in said else set())
     polling.check(*said, *PIECES.get(fault, ()))
@@ -373,12 +373,12 @@ def test_replies_at_9600_baud_are_read_without_early_requests(pump: SimulatedDri
         polling.until("ok", 10 * len(Slow.readings()))
     misses = polling.statuses().total() - polling.statuses()["ok"]
     assert slow.counters.damaged == 0
-    assert slow.counters.early <= misses  # only a late reply can make the next request early
+    assert slow.counters.early <= misses  # a request is only early after a late reply
     polling.check("ok")
 
 
 @pytest.mark.long
-def test_a_port_lost_during_a_reply_gives_misses_with_that_status() -> None:
+def test_a_port_lost_during_a_reply_gives_rows_with_status_port_lost() -> None:
     master, slave = os.openpty()
     with Polling(line(os.ttyname(slave), polled(drive(), READINGS))) as polling:
         os.read(master, 1024)
@@ -433,7 +433,7 @@ def test_polling_continues_after_a_stop_reopened_the_port(port: str) -> None:
         while not queued:  # on a busy computer, all queued requests may be over already
             polling.until("ok", 3)
             queued = queued_before_a_stop(hall)
-        polling.until("ok", 100)  # more values than queued requests
+        polling.until("ok", 100)  # more than the queued requests can give
     assert polling.statuses().keys() <= {"ok"} | HOST_LATE
     assert hall._ended_ns
     slots = (hall._ended_ns - hall.started_ns) / 1e9 // every
@@ -486,7 +486,7 @@ def test_a_slow_reopening_or_closing_does_not_delay_other_lines(
         assert is_held_up.wait(PATIENCE)
         late = threading.Thread(target=polling.poller.add, args=("hall-2", polled(drive(2, "fan-2"), ONE)))
         late.start()
-        polling.until("ok", 50, "pump-1")  # more values than queued requests
+        polling.until("ok", 50, "pump-1")  # more than the queued requests can give
         may_go_on.set()
         late.join(PATIENCE)
         polling.until("port lost", 1, "fan-2")

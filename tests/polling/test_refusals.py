@@ -263,7 +263,7 @@ def test_a_block_that_becomes_readable_again_is_polled_as_before(
     assert len(rows) > before / 4
 
 
-ANSWERED = ("ok", "no valid value")  # other statuses are possible on a busy computer
+ANSWERED = ("ok", "no valid value")  # statuses of rows with a reply; on a busy computer, some have none
 
 
 class Meter(Drive):
@@ -318,7 +318,7 @@ def test_registers_that_are_bit_fields_of_one_word_share_one_request() -> None:
     assert [(block.start, block.count, len(block.registers)) for block in found] == [(7, 1, 3), (8, 1, 1)]
 
 
-def test_a_scale_register_is_read_with_its_register() -> None:
+def test_a_value_and_its_scale_are_read_by_one_request() -> None:
     (block,) = blocks(Meter(1), [Meter.power])
     assert (block.start, block.count, block.offset(Meter.power)) == (8, 2, 0)
 
@@ -342,7 +342,7 @@ def test_polled_values_of_all_number_formats_are_correct() -> None:
     assert {row.status for row in last.values()} == {"ok"}
 
 
-def test_a_no_value_code_is_a_miss_with_its_reason() -> None:
+def test_a_code_for_no_value_gives_a_row_with_that_reason() -> None:
     sim = SimulatedDrive(Meter(1))
     sim["voltage"], sim["energy"], sim["probe"], sim["tariff"] = math.nan, None, None, None
     sim["power_scale"] = -32768

@@ -142,7 +142,7 @@ def test_mistakes_are_listed_by_line_without_consequential_errors(tmp_path: Path
         assert part in sentence
 
 
-def test_error_for_a_plant_file_instead_of_a_test_file_names_the_command(tmp_path: Path) -> None:
+def test_loading_a_plant_file_as_a_test_suggests_multidrop_poll(tmp_path: Path) -> None:
     plant = write_test(tmp_path, "").with_name("plant.toml")
     with pytest.raises(ValueError, match=r"plant\.toml: this is a plant file; poll .* `multidrop poll .*`"):
         load_test(plant)
@@ -205,7 +205,7 @@ def test_error_for_a_test_that_is_too_fast_says_what_would_fit(
     assert "would fit with" in found
 
 
-def test_default_silence_is_longer_than_the_period_of_the_fault_code() -> None:
+def test_the_default_silence_limit_exceeds_the_fault_codes_period() -> None:
     fan = find_model("invt-che")(1, maximum_frequency=50, name="fan")
     polled = PolledDrive(fan, ["output_frequency", Polled(fan.register("fault"), 2.0)])
     plant = Plant([PlantLine("hall", "nowhere", drives=[polled])])
@@ -284,7 +284,7 @@ def test_a_fault_aborts_only_if_the_test_uses_the_drive(watch: LimitWatch) -> No
     assert watch.add([row("pump", "fault", 4.0)]).startswith("pump has a fault, ")
 
 
-def test_a_change_of_a_fault_record_aborts_but_an_old_record_does_not(tmp_path: Path) -> None:
+def test_only_a_new_fault_in_a_fault_record_aborts_a_run(tmp_path: Path) -> None:
     pump = {"model": "erman-er-g-220", "poll": ["output_frequency", "last_fault"]}
     watch = LimitWatch(load_test(write_test(tmp_path, TEXT, fan=CHE, pump=pump)), 2 * S, 0)
     assert watch.add([row("pump", "last_fault", 3.0), row("pump", "last_fault", 3.0)]) == ""
@@ -316,7 +316,7 @@ def test_values_of_a_channel_do_not_hide_a_silent_drive(watch: LimitWatch) -> No
     assert watch.silent(3 * S) == "no value of pump came for 3.0 s"
 
 
-def test_a_step_condition_needs_a_value_from_after_the_steps_start(watch: LimitWatch, tmp_path: Path) -> None:
+def test_a_step_condition_ignores_values_read_before_the_step(watch: LimitWatch, tmp_path: Path) -> None:
     (condition,) = (step.until for step in load_test(tmp_path / "test.toml").steps)
     assert condition
     assert not watch.holds(condition, 0)

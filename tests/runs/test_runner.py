@@ -143,7 +143,7 @@ def test_an_abort_stops_all_drives_and_says_why(kind: str, tmp_path: Path) -> No
         happened: list[bool] = []
 
         def happen(rows: object) -> None:
-            quiet = {"fault": "steps 1", "silence": "hold"}  # elsewhere a command would fail first
+            quiet = {"fault": "steps 1", "silence": "hold"}  # phases without commands, which would fail first
             is_due = test.phase == quiet.get(kind, test.phase)
             if sims[0].motor.energised and is_due and not happened:
                 happened.append(True)
@@ -296,7 +296,7 @@ def test_no_step_is_shortened_by_a_delay_of_the_run(tmp_path: Path, monkeypatch:
     ("silence", "seconds", "why"),
     [
         ("3 s", 4, "no value of fan came for 4"),
-        ("1 min", 6, "the run stood still for 6"),  # new rows come at once: no silence
+        ("1 min", 6, "the run stood still for 6"),  # rows arrive immediately after the sleep
     ],
 )
 def test_no_step_is_carried_out_after_the_computer_has_slept(
@@ -412,7 +412,7 @@ def test_a_busy_computer_aborts_only_the_run_of_a_real_drive(
             monkeypatch.setattr(runner, "is_simulated", lambda identity: False)
         result = TestRun(plan, speed=1.0 if is_real else SPEED).run()
     assert bool(result.abort) == is_real
-    assert next(attempts) == (1 if is_real else 6)  # six: three attempts too late, and three steps
+    assert next(attempts) == (1 if is_real else 6)  # 6: three that expired, and one for each step
 
 
 WAIT = 'dwell = "2 min"'
@@ -439,12 +439,12 @@ class FarEnds:
         self.test = test
         self.sims: dict[str, Any] = {}
         self.requests: dict[str, list[Message]] = {}  # by line
-        self.cause: dict[str, int] | None = None  # by line: requests before the abort's reason
+        self.cause: dict[str, int] | None = None  # by line: number of requests at the call of `happen`
         self.event: Callable[[FarEnds], object] | None = None  # called after two bus cycles of the first step
         self._left: dict[str, int] = {}  # by line: number of requests until the event
         self._monkeypatch = monkeypatch
         self._clock, self._ticked = 0.0, threading.Condition()
-        self._due: dict[str, float] = {}  # by line: time of the newest reply
+        self._due: dict[str, float] = {}  # simulated time of the next reply, by line
         self._is_stopping = False
         self._is_stop_sent: set[str] = set()  # lines
         sleep, begin_stops, carry_out = clock.sleep, _Session._begin_stops, Line.carry_out
@@ -475,7 +475,7 @@ class FarEnds:
     def run(self, event: Callable[[FarEnds], object]) -> RunResult:
         self.event = event
         with ExitStack() as stack:
-            for line in self.test.plan.plant.lines:  # replies wait in a thread per line
+            for line in self.test.plan.plant.lines:  # one simulator, so one thread, for each line
                 sims = [simulated(polled.drive) for polled in line.drives]
                 for sim in sims:
                     self._watch(sim, line)
@@ -633,7 +633,7 @@ FAMILIES = [model for model in (*MODELS, *SHIPPED) if find_model(model).stop is 
 
 @pytest.mark.long
 @pytest.mark.parametrize("model", FAMILIES)
-def test_each_familys_first_stop_of_an_abort_comes_within_two_bus_cycles(model: str, tmp_path: Path) -> None:
+def test_an_abort_stops_each_family_within_two_bus_cycles(model: str, tmp_path: Path) -> None:
     """The simulated drives count requests from the read of the high value to the first write."""
     family = find_model(model)
     numbers = [register.name for register in family.readings() if register.values is None and register.step]
@@ -652,7 +652,7 @@ def test_each_familys_first_stop_of_an_abort_comes_within_two_bus_cycles(model: 
         are_writes: list[bool] = []  # for each request: is it a write?
         reads: list[int] = []  # indexes of the requests that have read the high value
         for sim in sims:
-            _note(sim, are_writes, lambda: sims[0].__setitem__(limited, 0.0))  # the write is a stop
+            _note(sim, are_writes, lambda: sims[0].__setitem__(limited, 0.0))  # only stops write
         refresh = sims[0].refresh
 
         def note_read(cell: MemoryCell) -> None:

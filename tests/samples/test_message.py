@@ -189,7 +189,7 @@ def written(options: pa.ipc.IpcWriteOptions | None = None, **other: pa.Array) ->
     ],
 )
 def test_rows_that_no_store_accepts_are_rejected(column: str, rows: pa.Array, said: str) -> None:
-    """The hub could not store a message with such rows, nor all later messages of all gateways."""
+    """A hub that accepted such rows could store no later message of any gateway."""
     with pytest.raises(MessageError, match=f"bytes are not a message of samples: {said}"):
         unpack(written(**{column: rows}))
 
@@ -200,7 +200,7 @@ def test_a_message_written_by_another_arrow_program_is_accepted() -> None:
 
 
 def alike(rows: int) -> dict[str, Any]:
-    """Return the columns of this many equal rows."""
+    """Return columns of `rows` equal rows."""
     names = ("drive", "register", "status", "unit")
     return {
         "time": pa.repeat(times(UTC_0)[0], rows),
@@ -221,7 +221,7 @@ def test_a_message_with_too_many_rows_is_rejected() -> None:
 
 BOMB = 1 << 28  # bytes
 ZSTD = pa.ipc.IpcWriteOptions(compression="zstd")
-# functions that return columns of this many rows: small, but large once converted to the column's type
+# Functions that return a column with `rows` rows. It is small until it is converted to the column's type.
 OF_ONE_TEXT = {
     "unit": lambda rows: pa.RunEndEncodedArray.from_arrays([rows], pa.array(["f" * 9000])),
     "value": lambda rows: pa.DictionaryArray.from_arrays(pa.repeat(0, rows), pa.array(["1" * 9000])),
