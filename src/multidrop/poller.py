@@ -274,7 +274,7 @@ class Poller(RowSource):
 
     @property
     def polled_since(self) -> dict[str, int]:
-        """For each drive name, the `monotonic_ns` since which rows belong to `plant`'s drive of that name."""
+        """By drive name: the `monotonic_ns` from which on rows come from the present drive of that name."""
         return {name: since_ns for line in self._lines for name, since_ns in line.since_ns.items()}
 
     def _adopt_channels(self) -> None:
@@ -327,7 +327,7 @@ class Poller(RowSource):
         self._add_line(line)
 
     def _take_signals(self) -> None:
-        """With `stop_on_exit`, install the signal handlers for new lines, if this is the main thread."""
+        """Install the signal handlers for `stop_on_exit`, if it was called. Only the main thread can."""
         if self._lines.stops_on_exit:
             with suppress(ValueError):
                 exit_hook().take_signals()

@@ -93,10 +93,9 @@ class ChannelSet:
         self._known_ns: dict[int, int] = {}  # by index: the monotonic time of the newest known value
         self._gaps: set[int] = set()  # indexes of channels for which a value is too old
         self._holds_ns = [round(hold_s * 1e9) for hold_s in series.holds_s]
-        # by index of a channel with restored totals: the UTC time in ns of the newest value in these totals
-        self._left_off: dict[int, int] = {}
-        # by index of a channel with totals: the UTC time in ns of its newest value
-        self._newest_ns: dict[int, int] = {}
+        # UTC in ns of the newest value in the restored totals, by channel index
+        self._restored_ns: dict[int, int] = {}
+        self._newest_ns: dict[int, int] = {}  # UTC in ns of the newest value in the totals, by channel index
         # periods without values that have ended; the caller empties this list
         self.outages: list[Outage] = []
         self._slept_ns = 0  # how long the computer has slept, at the latest call of `compute`
@@ -205,10 +204,10 @@ class ChannelSet:
             yield row
 
     def _expire(self, computed: _Computed, now_ns: int) -> None:
-        """Start an outage of each value that a channel uses and that is too old at `now_ns` (monotonic).
+        """Treat the values of a channel's registers as unknown if they are too old at `now_ns` (monotonic).
 
-        During an outage the value is unknown, and functions with a memory, such as integrals, do not count
-        the time. The status is OLD, unless the newest row already has no value for another reason.
+        Integrals and other stateful functions do not count the time until the next known value. The status
+        becomes OLD, unless the newest row already has no value for another reason.
         """
         gone = set()
         for slot in computed.program.slots:
@@ -234,11 +233,10 @@ class ChannelSet:
 
     def _status(self, slots: Iterable[int]) -> int:
         """Return the status of a row that is computed from the newest rows of these series."""
-        # the newest row without a value decides; otherwise a series that has had no row yet
-        misses = [slot for slot in slots if self._statuses[slot] not in (Status.OK, UNSEEN)]
-        if misses:
-            return self._statuses[max(misses, key=self._sent_ns.__getitem__)]
-        return min(self._statuses[slot] for slot in slots)
+        missing = [slot for slot in slots if self._statuses[slot] not in (Status.OK, UNSEEN)]
+        if missing:
+            return self._statuses[max(missing, key=self._sent_ns.__getitem__)]
+        return min(self._statuses[slot] for slot in slots)  # UNSEEN if a series has had no row yet
 
     def _note_outages(self, computed: _Computed, row: SlotRow) -> None:
         """If an outage of this channel ended with this row, add it to `outages`.
@@ -251,8 +249,8 @@ class ChannelSet:
         seconds = max(memory.outage_s for memory in totals)
         for memory in totals:
             memory.outage_s = 0.0
-        if (left_off_ns := self._left_off.pop(computed.slot, None)) is not None:
-            seconds = max(seconds, (row.time_ns - left_off_ns) / 1e9)
+        if (restored_ns := self._restored_ns.pop(computed.slot, None)) is not None:
+            seconds = max(seconds, (row.time_ns - restored_ns) / 1e9)
         if seconds > 0:
             self.outages.append(Outage(computed.name, row.time_ns, seconds))
         self._newest_ns[computed.slot] = row.time_ns
@@ -271,9 +269,9 @@ class ChannelSet:
             if same := known.get((one.name, one.channel, *one.program.units)):
                 for memory, old in zip(one.program.memories, same.program.memories, strict=True):
                     memory.take_over(old)
-                self._left_off.pop(one.slot, None)
-                if same.slot in before._left_off:
-                    self._left_off[one.slot] = before._left_off[same.slot]
+                self._restored_ns.pop(one.slot, None)
+                if same.slot in before._restored_ns:
+                    self._restored_ns[one.slot] = before._restored_ns[same.slot]
                 if same.slot in before._newest_ns:
                     self._newest_ns[one.slot] = before._newest_ns[same.slot]
         changed = {slot for (drive, _), slot in self.inputs.items() if drive in replaced}
@@ -289,7 +287,7 @@ class ChannelSet:
                 "value": one.channel.value,
                 "units": one.program.units,
                 "totals": [memory.kept for memory in one.program.totals],
-                "time_ns": self._newest_ns.get(one.slot, self._left_off.get(one.slot)),
+                "time_ns": self._newest_ns.get(one.slot, self._restored_ns.get(one.slot)),
             }
             for one in self._computed
             if one.channel.is_kept and one.program.totals
@@ -314,7 +312,7 @@ class ChannelSet:
                 memory.kept = own
             time_ns = about.get("time_ns")
             if isinstance(time_ns, int) and 0 < time_ns < 1 << 63:
-                self._left_off[one.slot] = time_ns
+                self._restored_ns[one.slot] = time_ns
         return changed
 
 

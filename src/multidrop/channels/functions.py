@@ -1,8 +1,8 @@
 """The operators and functions of channel expressions, with the units and values of their results.
 
 A value that is not known is None. Pure functions then return None, unless the result does not depend on that
-value. Functions with a memory, such as
-`integral`, get each value with the time of its request, and note outages: times without a known value.
+value. Stateful functions, such as `integral`, get each value with the time of its request, and note outages:
+times without a known value.
 """
 
 from __future__ import annotations
@@ -137,7 +137,7 @@ def _is(compare: Callable[[Any, Any], bool]) -> Callable[[float, float], float]:
 
 
 class Function(NamedTuple):
-    """A function without a memory: its number of operands, and functions that compute its unit and value."""
+    """A stateless function: its number of operands, and functions that compute its unit and value."""
 
     arities: range
     typed: Callable[[Units], Typed]
@@ -192,17 +192,17 @@ class Curve:
         return self._values[place - 1] * (1.0 - part) + self._values[place] * part
 
 
-# ---- functions with a memory ----
+# ---- stateful functions ----
 
 
 class StatefulFunction:
-    """A function with a memory. Call `take` once for each known value, in the order of time.
+    """A function of all values so far, such as an integral. Call `take` once for each known value.
 
-    `kept` has the numbers to store in a file. Values that are further apart than `hold_ns` have an outage
-    between them, and so have the values before and after `is_interrupted` was set.
+    `kept` has the numbers to store in a file. The time between two values is an outage if it is longer than
+    `hold_ns`, or if `is_interrupted` was set in between.
     """
 
-    is_total = True  # True if the memory is kept over restarts
+    is_total = True  # True if `kept` is stored over restarts
     typed: Callable[[Units], Typed]
 
     def __init__(self) -> None:
@@ -214,10 +214,10 @@ class StatefulFunction:
         self._last = 0.0
 
     def take(self, value: float, now_ns: int) -> None:
-        """Add a value to the memory. Its request was sent at `now_ns` (monotonic)."""
+        """Process a value. Its request was sent at `now_ns` (monotonic); older values are ignored."""
         if self._last_ns is None:
             self._first(value)
-        # rows of several lines may be out of order, so ignore older ones
+        # older value: rows of several lines may be out of order
         elif now_ns <= self._last_ns:
             return
         else:
@@ -234,7 +234,7 @@ class StatefulFunction:
             self._last_ns -= slept_ns
 
     def take_over(self, before: StatefulFunction) -> None:
-        """Continue with the memory of the same function in an earlier program of the channel."""
+        """Continue from the state of `before`, the same function before the plant was changed."""
         vars(self).update(vars(before) | {"hold_ns": self.hold_ns})
 
     def _first(self, value: float) -> None: ...

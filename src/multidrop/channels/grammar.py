@@ -128,11 +128,11 @@ class _ExpressionParser:
         self.steps: list[Step] = []
         self._expression(0)
         if self._token.kind != "end":
-            raise self._wrong("an operator is missing before")
+            raise self._missing("an operator")
 
-    def _wrong(self, what: str) -> ExpressionError:
+    def _missing(self, missing: str) -> ExpressionError:
         shown = f"{self._token.text!r}" if self._token.text else "the end"
-        return ExpressionError(self._token.column, f"{what} {shown}")
+        return ExpressionError(self._token.column, f"{missing} is missing before {shown}")
 
     def _next(self) -> _Token:
         token, self._token = self._token, next(self._tokens, self._token)
@@ -140,7 +140,7 @@ class _ExpressionParser:
 
     def _expect(self, sign: str) -> None:
         if self._token.text != sign or self._token.kind != "sign":
-            raise self._wrong(f"{sign!r} is missing before")
+            raise self._missing(repr(sign))
         self._next()
 
     def _expression(self, least: int) -> None:

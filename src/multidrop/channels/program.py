@@ -76,7 +76,7 @@ class _Operand(NamedTuple):
 
 
 class _Memorised(NamedTuple):
-    """An instruction to call a function with a memory, such as an integral.
+    """An instruction to call a stateful function, such as an integral.
 
     `slots` are the indexes of the registers and channels in its operand.
     """
@@ -86,9 +86,9 @@ class _Memorised(NamedTuple):
 
 
 class _Applied(NamedTuple):
-    """An instruction to call a function without a memory. Each factor is multiplied with its operand.
+    """An instruction to call a stateless function, such as a sum.
 
-    `factors` is empty if all factors are 1.
+    Before the call, each operand is multiplied by its factor. `factors` is empty if all factors are 1.
     """
 
     value: Any
@@ -233,14 +233,14 @@ class Program:
         return typed.unit
 
     def _table(self, operands: list[_Operand]) -> ValueUnit:
-        """Replace the instructions for the points of a table by one; return the unit of its result."""
+        """Append the instruction for a call of `table`; return the unit of its result."""
         if len(operands) < 2 or operands[0].text is not None or operands[1].text is None:
-            raise ValueError('table takes a position, a unit and points: table(x, "m3/h", x1, y1, x2, y2)')
+            raise ValueError('table() takes a position, a unit and points: table(x, "m3/h", x1, y1, x2, y2)')
         points = operands[2:]
         for point in points:
             if point.number is None:
                 raise ExpressionError(point.column, "the points of a table must be numbers")
-        if points:
+        if points:  # the curve contains the points, so no instructions load them
             del self._instructions[-len(points) :]
         curve = Curve([point.number for point in points if point.number is not None])
         self._instructions.append(_Applied(curve, 1, ()))
@@ -248,7 +248,7 @@ class Program:
 
     def _as(self, operands: list[_Operand]) -> ValueUnit:
         if len(operands) != 2 or operands[1].text is None or operands[0].text is not None:
-            raise ValueError('as takes a value and a unit: as(x, "kW")')
+            raise ValueError('as() takes a value and a unit: as(x, "kW")')
         return unit_of(operands[1].text)
 
     @property
@@ -257,13 +257,13 @@ class Program:
         return [memory for memory in self.memories if memory.is_total]
 
     def interrupt(self, slots: Collection[int]) -> None:
-        """Start an outage in each function with a memory that uses one of these registers or channels."""
+        """Exclude the time until the next value from integrals etc. of these registers and channels."""
         for step in self._instructions:
             if isinstance(step, _Memorised) and not step.slots.isdisjoint(slots):
                 step.memory.is_interrupted = True
 
     def note_sleep(self, slept_ns: int) -> None:
-        """Count the time that the computer slept since the newest values of the functions with a memory."""
+        """Add the computer's sleep to the time since the newest value of each stateful function."""
         for memory in self.memories:
             memory.note_sleep(slept_ns)
 

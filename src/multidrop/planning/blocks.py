@@ -85,15 +85,15 @@ def plan(
     least, most = 0.0, math.inf
     for every, registers in rates.items():
         for neighbours in _neighbours(drive, registers):
-            ways = _ways(drive.framing, neighbours)
-            way = min(ways, key=lambda way: way.requests * overhead + way.characters * character)
-            blocks = (Block.of(drive, neighbours.registers[begin:end]) for begin, end in way.spans)
+            divisions = _divisions(drive.framing, neighbours)
+            best = min(divisions, key=lambda one: one.requests * overhead + one.characters * character)
+            blocks = (Block.of(drive, neighbours.registers[begin:end]) for begin, end in best.spans)
             found += [Planned(drive, block, every) for block in blocks]
-            for other in ways:
-                if other.requests < way.requests:
-                    most = min(most, _even(drive, other, way))
-                elif other.requests > way.requests:
-                    least = max(least, _even(drive, way, other))
+            for other in divisions:
+                if other.requests < best.requests:
+                    most = min(most, _equal_delay(drive, other, best))
+                elif other.requests > best.requests:
+                    least = max(least, _equal_delay(drive, best, other))
     return Plan(tuple(in_declared_order(drive, found)), least, most)
 
 
@@ -225,8 +225,8 @@ def _side_by_side(drive: Drive, wanted: list[tuple[range, Register[Any]]]) -> _N
 
 
 @dataclass(frozen=True)
-class _Way:
-    """The way to divide registers into a given number of requests that needs the fewest characters."""
+class _Division:
+    """A division of registers into requests. No other one with as many requests has fewer characters."""
 
     characters: int  # characters of all requests and their replies
     spans: tuple[tuple[int, int], ...]  # begin and end of each request, which reads registers[begin:end]
@@ -237,37 +237,38 @@ class _Way:
 
 
 @lru_cache(maxsize=256)
-def _ways(framing: Framing, neighbours: _Neighbours) -> tuple[_Way, ...]:
-    """Return the divisions that are the quickest at some response delay, sorted by number of requests.
+def _divisions(framing: Framing, neighbours: _Neighbours) -> tuple[_Division, ...]:
+    """Return the divisions of these registers that may be the quickest, sorted by number of requests.
 
-    With a long delay, few requests are quicker; with a short delay, few characters. The algorithm is dynamic
-    programming over the first register of the last request.
+    It depends on the drive's response delay which one is the quickest: if the delay is long, one with few
+    requests; if it is short, one with few characters. The algorithm is dynamic programming over the first
+    register of the last request.
     """
-    fronts: list[list[_Way]] = [[_Way(0, ())]]  # item n: the ways to divide the first n registers
+    fronts: list[list[_Division]] = [[_Division(0, ())]]  # item n: the divisions of the first n registers
     for end in range(1, len(neighbours.registers) + 1):
-        fewest: dict[int, _Way] = {}  # the division with the fewest characters, by number of requests
+        fewest: dict[int, _Division] = {}  # by number of requests
         for begin, count in neighbours.ending_at(end):
             own = characters(framing, neighbours.carrier, count)
             for before in fronts[begin]:
                 known = fewest.get(before.requests + 1)
                 if known is None or before.characters + own < known.characters:
-                    way = _Way(before.characters + own, (*before.spans, (begin, end)))
-                    fewest[way.requests] = way
+                    longer = _Division(before.characters + own, (*before.spans, (begin, end)))
+                    fewest[longer.requests] = longer
         fronts.append(_worthwhile(fewest))
     return tuple(fronts[-1])
 
 
-def _worthwhile(ways: dict[int, _Way]) -> list[_Way]:
-    """Drop each way that needs more requests than another one without saving characters."""
-    kept: list[_Way] = []
-    for requests in sorted(ways):
-        if not kept or ways[requests].characters < kept[-1].characters:
-            kept.append(ways[requests])
+def _worthwhile(divisions: dict[int, _Division]) -> list[_Division]:
+    """Drop each division that has more requests than another one, but not fewer characters."""
+    kept: list[_Division] = []
+    for requests in sorted(divisions):
+        if not kept or divisions[requests].characters < kept[-1].characters:
+            kept.append(divisions[requests])
     return kept
 
 
-def _even(drive: Drive, few: _Way, many: _Way) -> float:
-    """Return the response delay in s at which both ways to divide the reads take equally long."""
+def _equal_delay(drive: Drive, few: _Division, many: _Division) -> float:
+    """Return the response delay in s at which both divisions take equally long."""
     saved = (few.characters - many.characters) * drive.settings.character
     return saved / (many.requests - few.requests) - silence(drive)
 
@@ -287,7 +288,7 @@ def halves(drive: Drive, block: Block) -> tuple[Block, ...]:
 
 
 def _units(drive: Drive, block: Block) -> list[list[Register[Any]]]:
-    """Group a request's registers so that one request must read each group; sorted by address."""
+    """Return the smallest groups into which a request can be split, sorted by address."""
     groups = {name: place for place, group in enumerate(drive.read_together) for name in group}
     found: dict[object, list[Register[Any]]] = {}
     for register in block.registers:
@@ -297,7 +298,7 @@ def _units(drive: Drive, block: Block) -> list[list[Register[Any]]]:
 
 
 def may_be_too_long(drive: Drive, block: Block) -> bool:
-    """Return True if the drive may not answer so long a read, because its class states no limit."""
+    """Return True if the request is possibly too long for the drive: its class states no limit."""
     return stated_limit(drive, block.table) is None and len(_units(drive, block)) > 1
 
 

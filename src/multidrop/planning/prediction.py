@@ -73,7 +73,7 @@ class _Done(NamedTuple):
     skipped: int = 0
     first_ns: int = 0
     last_ns: int = 0
-    taken: float = 0.0  # s of line time, including the silence before each exchange
+    taken: float = 0.0  # s of bus time, including the silence before each exchange
 
 
 NOT_RUN = _Done()
@@ -89,7 +89,7 @@ class _PredictedJob:
 
     @property
     def cost(self) -> float:
-        """The mean line time of an exchange, in s."""
+        """The mean bus time of an exchange, in s."""
         done = self.done
         return done.taken / done.exchanges if done.exchanges else self.own + silence(self.planned.drive)
 
@@ -284,7 +284,7 @@ SLOWER = 1.05  # factor between one period that is tried and the next
 
 @dataclass(frozen=True)
 class Suggestions:
-    """Three changes to a line. Each one alone lets the line reach its rates; None if it cannot."""
+    """Three changes to a line. Each one alone lets the line reach its rates; None if no change can."""
 
     every: tuple[tuple[float, float], ...]  # pairs of a wanted period and a period that can be reached, in s
     # lowest baud rate that is enough, and the drives that now have a lower one

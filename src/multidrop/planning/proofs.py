@@ -20,13 +20,13 @@ from multidrop.drive.register import COIL, DISCRETE, HOLDING, INPUT, Access, Car
 from multidrop.drive.request import read_request
 from multidrop.planning.blocks import Block, all_requests
 
-MOST_PROOFS = 4  # limit of proofs (see `proofs`) per drive, because each one uses memory
+MOST_PROOFS = 4  # limit of a drive's requests that serve as proofs, because each one uses memory
 
-# Tables to read as proofs if a device's other replies all look alike. Even an exception reply has the
-# function code of its table.
+# If a device's own registers allow too few different replies, its proofs also read these tables. Even an
+# exception reply has the function code of its table.
 OTHER_TABLES = (INPUT, COIL, HOLDING, DISCRETE)
-# Number of proofs (see `proofs`) that a drive needs. A late reply to the first proof may still come, so the
-# second is needed. The third is only sent when a silent drive answers again.
+# Number of different proofs that a drive needs. The second one is needed while a late reply to the first one
+# may still come. The third one is only sent when a silent drive answers again.
 ENOUGH = 3
 
 RawRange = tuple[int, int]  # lowest and highest raw count that the only register of a reply can have
@@ -42,7 +42,7 @@ def proofs(drive: Drive) -> list[tuple[Block, RawRange | None]]:
     known = [(Block.of(drive, [register]), counts) for register, counts in drive.known_counts().items()]
     family: Any = type(drive)
     found: list[tuple[Block, RawRange | None]] = [
-        (Block.of(drive, registers), None) for registers in _told_apart(family)
+        (Block.of(drive, registers), None) for registers in _with_distinct_replies(family)
     ]
     if known:
         found = [*known, *found[1:]]
@@ -56,11 +56,11 @@ def proofs(drive: Drive) -> list[tuple[Block, RawRange | None]]:
 
 
 @lru_cache(maxsize=256)
-def _told_apart(family: Any) -> tuple[tuple[Register[Any], ...], ...]:
-    """Return groups of registers; the reply to a group's read differs from those of all other groups.
+def _with_distinct_replies(family: Any) -> tuple[tuple[Register[Any], ...], ...]:
+    """Return the registers of requests whose replies all differ, one tuple of registers for each request.
 
-    Groups of readings come first, because readings are polled anyway; shorter requests come before longer
-    ones. If there are many groups, only the first MOST_PROOFS and the last one are returned.
+    Requests for readings come first, because readings are polled anyway. Shorter requests come before longer
+    ones. If there are many requests, only the first MOST_PROOFS and the last one are returned.
     """
     readable: list[Register[Any]] = [register for register in family.registers.values() if register.readable]
     readings = [register for register in readable if register.access is Access.READING]
@@ -75,7 +75,7 @@ def _told_apart(family: Any) -> tuple[tuple[Register[Any], ...], ...]:
 
 
 def _of_other_tables(drive: Drive, found: Sequence[Block]) -> list[Block]:
-    """Return requests for one register each. No two of them, or of `found`, have the same function code."""
+    """Return a read of each table in OTHER_TABLES whose function code no request in `found` has."""
     start = found[0].start if found else 0
     functions = {block.table.read for block in found}
     return [

@@ -17,14 +17,14 @@ from dataclasses import dataclass, field
 from typing import Generic, NamedTuple, TypeVar
 
 TURN_SHARE = 0.05  # least fraction of the line's time for jobs without a period
-# limit of the line time that jobs without a period may use in advance
+# limit of the bus time that jobs without a period may use in advance
 CREDIT_NS = 50_000_000
 NEVER_NS = 1 << 63
 SILENT_AFTER = 2  # number of successive failures after which a drive gets no requests for a while
-FIRST_REST_NS = 500_000_000
-LONGEST_REST_NS = 2_000_000_000
+FIRST_PAUSE_NS = 500_000_000
+LONGEST_PAUSE_NS = 2_000_000_000
 SILENT_SHARE = 0.015  # fraction of the line's time for requests to silent drives
-# limit of the line time for second requests to all new drives that did not reply
+# bus time that the second requests to all silent new drives may take together
 SECOND_COST_NS = 400_000_000
 
 
@@ -75,27 +75,27 @@ class Health:
     is_pending: bool = False  # True if the drive is new and its first request has no result yet
     failures: int = 0
     late_until_ns: int = 0
-    rest_ns: int = 0
-    asleep_until_ns: int = 0
-    cost_ns: int = 0  # line time of a request that gets no reply
+    pause_ns: int = 0
+    paused_until_ns: int = 0
+    cost_ns: int = 0  # bus time of a request that gets no reply
 
 
 @dataclass
 class BackOff:
     """Back off from a line's silent drives, so that other drives lose little time.
 
-    A silent drive rests (gets no request) for longer each time. After each rest it gets its shortest request,
-    in spare time or in the line time of jobs without a period. All silent drives together take only a small
-    share of the line. But the first rest of a drive that has answered before is always short, because the
-    drive may have missed two requests by chance. When a silent drive replies, its rests end. The next silent
-    drive is then tried immediately, because both may have been without power.
+    A silent drive gets no requests during a pause. Then it gets its shortest request, in spare time or in the
+    bus time of jobs without a period. Without a reply, a longer pause follows. All silent drives together
+    take only a small share of the bus time. But the first pause of a drive that has answered before is always
+    short, because the drive may have missed two requests by chance. When a silent drive replies, its pauses
+    end. Another silent drive is then tried immediately, because both may have been without power.
 
-    A new drive, which has never answered, gets one request and no other until the outcome is known; without a
-    reply it rests immediately. Once all new drives have had their first request, the silent ones get a second
-    request if they are few. Drives are given by address.
+    A new drive, which has never answered, gets one request and no other until the outcome is known. If no
+    reply comes, its pause starts immediately. Once all new drives have had their first request, the silent
+    ones get a second request if they are few. Drives are given by address.
     """
 
-    begin_rest: Callable[[int, int], None]  # called with the drive's address and the time
+    begin_pause: Callable[[int, int], None]  # called with the drive's address and the time
     health: dict[int, Health] = field(default_factory=dict)
     has_silent: bool = False  # True if any drive is new or did not answer its last request
     _late_until_ns: int = 0  # latest `late_until_ns` of all drives
@@ -112,19 +112,19 @@ class BackOff:
         if drive in self.health:
             self.health[drive].is_pending = False
 
-    def may_sleep(self, at_ns: int) -> bool:
-        """Return True if any drive may be resting now; see `is_asleep`."""
+    def has_pauses(self, at_ns: int) -> bool:
+        """Return False if no drive pauses now; True if one may pause, see `is_paused`."""
         return self.has_silent or at_ns < self._late_until_ns
 
-    def is_asleep(self, drive: int, at_ns: int) -> bool:
+    def is_paused(self, drive: int, at_ns: int) -> bool:
         health = self.health[drive]
-        return health.rest_ns > 0 or at_ns < max(health.asleep_until_ns, health.late_until_ns)
+        return health.pause_ns > 0 or at_ns < max(health.paused_until_ns, health.late_until_ns)
 
-    def wake(self, at_ns: int) -> int | None:
-        """Return a drive whose rest is over, and start its next rest; None if there is no such drive."""
+    def next_retry(self, at_ns: int) -> int | None:
+        """Return a drive whose pause has ended, and start its next pause; None if there is no such drive."""
         for drive, health in self.health.items():
-            if health.rest_ns and at_ns >= health.asleep_until_ns and not health.is_pending:
-                health.asleep_until_ns = at_ns + health.rest_ns
+            if health.pause_ns and at_ns >= health.paused_until_ns and not health.is_pending:
+                health.paused_until_ns = at_ns + health.pause_ns
                 return drive
         return None
 
@@ -140,7 +140,7 @@ class BackOff:
     ) -> None:
         """Record how many requests to a drive have failed in a row.
 
-        `cost_ns` is the line time of its next request if no reply comes. Until `late_until_ns` a reply to an
+        `cost_ns` is the bus time of its next request if no reply comes. Until `late_until_ns` a reply to an
         earlier request may come. Until then the drive gets no request, even if it has answered another one.
         Once the late reply has come, the drive can be tried immediately.
         """
@@ -150,38 +150,38 @@ class BackOff:
         health.failures, health.late_until_ns, health.cost_ns = failures, late_until_ns, cost_ns
         health.is_new &= not has_answered
         if has_changed and failures:
-            self._rest(drive, now_ns)
+            self._pause(drive, now_ns)
         elif has_changed:
-            if health.rest_ns:
-                self._wake_next(drive, now_ns)
-            health.rest_ns = health.asleep_until_ns = 0
+            if health.pause_ns:
+                self._end_next_pause(drive, now_ns)
+            health.pause_ns = health.paused_until_ns = 0
         elif has_answered_late:
-            health.asleep_until_ns = now_ns
+            health.paused_until_ns = now_ns
         if self.has_silent:
             self._try_new_again(now_ns)
         self.has_silent = any(health.failures or health.is_new for health in self.health.values())
         self._late_until_ns = max(health.late_until_ns for health in self.health.values())
 
-    def _rest(self, drive: int, now_ns: int) -> None:
+    def _pause(self, drive: int, now_ns: int) -> None:
         health = self.health[drive]
-        rest_ns = 0
+        pause_ns = 0
         if health.failures >= (1 if health.is_new else SILENT_AFTER):
-            is_first = not health.rest_ns and not health.is_new
-            health.rest_ns = min(max(2 * health.rest_ns, FIRST_REST_NS), LONGEST_REST_NS)
-            rest_ns = health.rest_ns if is_first else max(health.rest_ns, self._fair_rest_ns())
-            self.begin_rest(drive, now_ns)
-        health.asleep_until_ns = max(health.late_until_ns, now_ns + rest_ns)
+            is_first = not health.pause_ns and not health.is_new
+            health.pause_ns = min(max(2 * health.pause_ns, FIRST_PAUSE_NS), LONGEST_PAUSE_NS)
+            pause_ns = health.pause_ns if is_first else max(health.pause_ns, self._fair_pause_ns())
+            self.begin_pause(drive, now_ns)
+        health.paused_until_ns = max(health.late_until_ns, now_ns + pause_ns)
 
-    def _fair_rest_ns(self) -> int:
-        """Return the rest in ns that keeps requests to all silent drives within SILENT_SHARE."""
-        return round(sum(health.cost_ns for health in self.health.values() if health.rest_ns) / SILENT_SHARE)
+    def _fair_pause_ns(self) -> int:
+        """Return a pause in ns after which requests to silent drives take only SILENT_SHARE of the time."""
+        return round(sum(health.cost_ns for health in self.health.values() if health.pause_ns) / SILENT_SHARE)
 
-    def _wake_next(self, drive: int, now_ns: int) -> None:
-        """Let the silent drive whose rest ends next be tried now, because this drive answers again."""
-        resting = [health for number, health in self.health.items() if health.rest_ns and number != drive]
-        if resting:
-            first = min(resting, key=lambda health: health.asleep_until_ns)
-            first.asleep_until_ns = min(first.asleep_until_ns, max(now_ns, first.late_until_ns))
+    def _end_next_pause(self, drive: int, now_ns: int) -> None:
+        """End the pause of the silent drive, other than `drive`, whose pause would end next."""
+        paused = [health for number, health in self.health.items() if health.pause_ns and number != drive]
+        if paused:
+            first = min(paused, key=lambda health: health.paused_until_ns)
+            first.paused_until_ns = min(first.paused_until_ns, max(now_ns, first.late_until_ns))
 
     def _try_new_again(self, now_ns: int) -> None:
         """Let silent new drives be tried again now, if all new drives had a request and few were silent."""
@@ -189,7 +189,7 @@ class BackOff:
         silent = [health for health in new if health.failures == 1]
         if all(health.failures for health in new) and sum(each.cost_ns for each in silent) <= SECOND_COST_NS:
             for health in silent:
-                health.asleep_until_ns = max(now_ns, health.late_until_ns)
+                health.paused_until_ns = max(now_ns, health.late_until_ns)
 
 
 # ---- the schedule ----
@@ -206,15 +206,16 @@ class Schedule(Generic[J]):
         self.jobs: list[J] = []
         # slots without a request because the drive is silent: job and start of the slot
         self.unasked: list[tuple[J, int]] = []
-        self.back_off = BackOff(self._begin_rest)
+        self.back_off = BackOff(self._begin_pause)
         self._health: dict[int, Health] = self.back_off.health
         self._waiting: list[tuple[int, int, J]] = []  # heap of (start of the slot, number, job)
         self._begun: list[J] = []  # jobs whose slot has started but is not carried out yet
-        self._ready: dict[int, int] = {}  # earliest time of the next request to each drive that needs pauses
-        self._held: list[J] = []  # jobs without a period that must wait until their drive's pause has ended
+        # earliest time of the next request, by drive; only for drives with a least interval
+        self._ready: dict[int, int] = {}
+        self._held: list[J] = []  # jobs without a period that wait for the end of their drive's interval
         self._round: list[J] = []  # jobs without a period, in the order of their turns
         self._next = 0  # index in `_round` of the next job
-        # line time that jobs without a period are entitled to; negative: used in advance
+        # bus time that jobs without a period are entitled to; negative: used in advance
         self._owed_ns = -CREDIT_NS
         self._is_late = False  # True from a skipped slot until no job is due
         self._kind: Hashable = None  # line settings and silence of the job that was taken last
@@ -269,11 +270,11 @@ class Schedule(Generic[J]):
     # ---- the next jobs ----
 
     def cycle(self, now_ns: int) -> list[J]:
-        """Return the jobs without a period, starting with the next one.
+        """Return the jobs of the bus cycle, starting with the next one, if the core can repeat the cycle.
 
-        Return [] if any job has a period, or needs pauses, or if any drive is silent.
+        Return [] if it cannot, because a job has a period or a least interval, or because a drive is silent.
         """
-        if self.back_off.may_sleep(now_ns) or self._waiting or self._begun or self._ready:
+        if self.back_off.has_pauses(now_ns) or self._waiting or self._begun or self._ready:
             return []
         return self._round[self._next :] + self._round[: self._next]
 
@@ -307,7 +308,7 @@ class Schedule(Generic[J]):
         return not self._ready or at_ns >= self._ready.get(job.drive, 0)
 
     def _next_ns(self, at_ns: int) -> int:
-        """Return the earliest future time at which a slot starts or a drive's pause ends."""
+        """Return the earliest future time at which a slot starts or a drive's least interval ends."""
         times = [max(at_ns, self._waiting[0][0])] if self._waiting else []
         times += [ready_ns for ready_ns in self._ready.values() if ready_ns > at_ns]
         return min(times, default=NEVER_NS)
@@ -316,7 +317,7 @@ class Schedule(Generic[J]):
         """Start all slots that are due. Skip slots of drives that get no request now."""
         while self._waiting and self._waiting[0][0] <= by_ns:
             job = heapq.heappop(self._waiting)[2]
-            if self.back_off.is_asleep(job.drive, by_ns):
+            if self.back_off.is_paused(job.drive, by_ns):
                 self._pass(job)
             else:
                 self._begun.append(job)
@@ -333,8 +334,8 @@ class Schedule(Generic[J]):
         ends first. If there is time for all of these jobs before this slot ends, prefer a job of the same
         kind as the job that was chosen before.
         """
-        if self.back_off.may_sleep(at_ns):
-            for job in [job for job in self._begun if self.back_off.is_asleep(job.drive, at_ns)]:
+        if self.back_off.has_pauses(at_ns):
+            for job in [job for job in self._begun if self.back_off.is_paused(job.drive, at_ns)]:
                 self._begun.remove(job)
                 self._pass(job)
         if not self._begun:
@@ -355,19 +356,22 @@ class Schedule(Generic[J]):
         return min(begun, key=lambda job: (job.kind != self._kind, job.end_ns, job.number))
 
     def _in_turn(self, at_ns: int) -> J | None:
-        """Return the shortest job of a silent drive to try, else the next job without a period, else None."""
-        if self.back_off.has_silent and (drive := self.back_off.wake(at_ns)) is not None:
+        """Return a job for time that jobs with a period leave; None if there is none.
+
+        A silent drive whose pause has ended gets its shortest job. Else jobs without a period take turns.
+        """
+        if self.back_off.has_silent and (drive := self.back_off.next_retry(at_ns)) is not None:
             own = [job for job in self.jobs if job.drive == drive]
             if own:
                 return min(own, key=lambda job: job.duration_ns)
         for job in self._held:
-            if self._is_ready(job, at_ns) and self._is_awake(job, at_ns):
+            if self._is_ready(job, at_ns) and self._may_be_sent(job, at_ns):
                 self._held.remove(job)
                 return job
         for step in range(len(self._round)):
             number = (self._next + step) % len(self._round)
             job = self._round[number]
-            if not self._is_awake(job, at_ns):
+            if not self._may_be_sent(job, at_ns):
                 continue
             if self._is_ready(job, at_ns):
                 self._next = (number + 1) % len(self._round)
@@ -377,22 +381,22 @@ class Schedule(Generic[J]):
         self._owed_ns = -CREDIT_NS
         return None
 
-    def _is_awake(self, job: J, at_ns: int) -> bool:
-        return not self.back_off.is_asleep(job.drive, at_ns) and not self._health[job.drive].is_pending
+    def _may_be_sent(self, job: J, at_ns: int) -> bool:
+        return not self.back_off.is_paused(job.drive, at_ns) and not self._health[job.drive].is_pending
 
     def _take(self, job: J, at_ns: int) -> Turn[J]:
-        """Return the next exchange of a job. Count and skip its slots that are over."""
+        """Return the next exchange of a job. Skip and count the slots of the job that have already ended."""
         health = self._health[job.drive]
         health.is_pending = health.is_new
         ready_ns = self._ready.get(job.drive, 0)
-        if job.period_ns is None or health.rest_ns:  # a request that tries a silent drive does not use a slot
+        if job.period_ns is None or health.pause_ns:  # a retry of a silent drive does not use a slot
             self._owed_ns = max(self._owed_ns - self._duration_ns(job), -CREDIT_NS)
             return Turn(job, max(health.late_until_ns, ready_ns), None)
         self._begun.remove(job)
-        over = (at_ns - job.due_ns) // job.period_ns
-        job.skipped += over
-        self._is_late |= over > 0
-        due_ns = job.due_ns + over * job.period_ns
+        ended = (at_ns - job.due_ns) // job.period_ns
+        job.skipped += ended
+        self._is_late |= ended > 0
+        due_ns = job.due_ns + ended * job.period_ns
         job.due_ns, job.taken_ns = due_ns + job.period_ns, at_ns
         self._await(job)
         self._owed_ns += round(job.duration_ns * TURN_SHARE / (1 - TURN_SHARE))
@@ -400,10 +404,10 @@ class Schedule(Generic[J]):
 
     def _duration_ns(self, job: J) -> int:
         health = self._health[job.drive]
-        return max(job.duration_ns, health.cost_ns) if health.rest_ns else job.duration_ns
+        return max(job.duration_ns, health.cost_ns) if health.pause_ns else job.duration_ns
 
     def _put_off(self) -> None:
-        """Postpone the started slots of new drives whose first request has no result yet."""
+        """Postpone the due jobs of each new drive whose first request has no result yet."""
         for job in [job for job in self._begun if self._health[job.drive].is_pending]:
             self._begun.remove(job)
             self._await(job)
@@ -426,7 +430,7 @@ class Schedule(Generic[J]):
 
     # ---- slots without a request ----
 
-    def _begin_rest(self, drive: int, now_ns: int) -> None:
+    def _begin_pause(self, drive: int, now_ns: int) -> None:
         """Add the drive's jobs without a period to `unasked`, so that each gets one row without a value."""
         self.unasked += [(job, now_ns) for job in self._round if job.drive == drive]
 

@@ -43,8 +43,8 @@ from multidrop.toml_document import read_document
 class PlantError(ValueError):
     """Raised for a plant file with mistakes; `mistakes` has a sentence for each, with place and correction.
 
-    `right` is a plant with only those drives that can be stopped: their entries have no mistakes, except in
-    `every`, `poll` and channels. It is None if the file is not valid TOML.
+    `right` is a plant with the drives that can still be stopped. Mistakes in `every`, `poll` and channels do
+    not prevent a stop; drives with other mistakes are left out. It is None if the file is not valid TOML.
     """
 
     def __init__(self, mistakes: tuple[str, ...], right: Plant | None = None) -> None:
@@ -208,7 +208,7 @@ _NOT_ARGUMENTS = ("name", "model", "every", "poll", "channel")
 
 
 def _line(table: Any, place: TomlPlace) -> PlantLine | None:
-    """Return the line with its drives that can be stopped; None if the line itself has a mistake."""
+    """Return the line, without drives whose mistakes prevent a stop; None if the line has a mistake."""
     before = len(place.config_errors)
     given = place.check(table, LINE_KEYS)
     name, port = given.get("name", ""), given.get("port", "")
@@ -359,7 +359,7 @@ def _try_each(
     settings = model(**least).settings
     right = {"baudrate": str(settings.baudrate), "format": f'"{settings.format}"'}
     for key, value in inherited.items():
-        if key not in right:  # a silence depends on other keys
+        if key not in right:  # `silence` is checked with all other keys when the drive is made
             continue
         hint = f" (the line's); add {key} = {right[key]} to this drive"
         place.attempt(partial(model, **(least | {key: value})), hint=hint)

@@ -140,12 +140,12 @@ def _polled(drive: Drive, wanted: Polled | Register[Any] | str, every: float | N
     return Polled(drive.register(wanted) if isinstance(wanted, str) else wanted, every)
 
 
-def _all_of(kind: type[T], given: Iterable[T], right: str) -> tuple[T, ...]:
+def _all_of(kind: type[T], given: Iterable[T], owner: str, name: str) -> tuple[T, ...]:
     """Return the given objects as a tuple. Raises TypeError unless they are a list of this class."""
     found = tuple(given) if isinstance(given, Iterable) else ()
     if isinstance(given, Iterable) and all(isinstance(one, kind) for one in found):
         return found
-    raise TypeError(f"{right} as a list of {kind.__name__} objects, not {given!r}")
+    raise TypeError(f"{owner} takes {name} as a list of {kind.__name__} objects, not {given!r}")
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,7 @@ class PlantLine:
     def __post_init__(self) -> None:
         if self.baudrate is not None and not is_whole(self.baudrate):
             raise TypeError(f"a line's baud rate is a whole number, not {self.baudrate!r}")
-        object.__setattr__(self, "drives", _all_of(PolledDrive, self.drives, "PlantLine takes drives"))
+        object.__setattr__(self, "drives", _all_of(PolledDrive, self.drives, "PlantLine", "drives"))
 
     def at(self, port: str) -> PlantLine:
         """Return a copy of the line at another port, without `rs485` if the new port is a network port."""
@@ -189,7 +189,7 @@ class Plant:
     def __post_init__(self) -> None:
         if isinstance(self.lines, (str, Path)):
             raise TypeError(f"Plant takes lines; to load a plant file, write Plant.load({str(self.lines)!r})")
-        object.__setattr__(self, "lines", _all_of(PlantLine, self.lines, "Plant takes lines"))
+        object.__setattr__(self, "lines", _all_of(PlantLine, self.lines, "Plant", "lines"))
 
     @classmethod
     def load(cls, path: Path | str) -> Plant:
@@ -319,10 +319,10 @@ def _of_register(register: Register[Any]) -> dict[str, Any]:
 
 
 def allowed(plant: Plant, table: Mapping[str, Any], place: TomlPlace) -> dict[str, frozenset[str]]:
-    """Return the registers ("write") and verbs ("verbs") that a table `may` allows, as "drive.name".
+    """Return the registers ("write") and verbs ("verbs") that [serve.may] or [fleet.may] allows.
 
-    `table` has checked values of MAY_KEYS. Errors are added to `place`. `stop` is never listed: it is always
-    allowed.
+    Each is given as "drive.name". `table` has checked values of MAY_KEYS. Errors are added to `place`. `stop`
+    is never listed: it is always allowed.
     """
     found: dict[str, set[str]] = {key: set() for key in MAY_LISTS}
     for key, names in found.items():
@@ -348,16 +348,14 @@ def _listed(plant: Plant, key: str, entry: object) -> list[str]:
     name, dot, rest = entry.rpartition(".") if isinstance(entry, str) else ("", "", "")
     if not dot:
         raise ValueError(f"{key}: {entry!r} is not right; write {MAY_LISTS[key].example}")
-    drives = [polled.drive for polled in plant.drives]
-    if "*" not in name or any(drive.name == name for drive in drives):
-        try:
-            _, drive = plant.find_drive(name)
-        except ValueError as unknown:
-            raise ValueError(f"{key}: {str(unknown).replace(f'{plant.path} has', 'there is')}") from None
-        return [_entry(key, drive, rest)]
+    drives = {polled.drive.name: polled.drive for polled in plant.drives}
+    if name in drives:
+        return [_entry(key, drives[name], rest)]
+    if "*" not in name:
+        raise ValueError(f"{key}: there is no drive {name!r}; {did_you_mean(name, drives)}")
     pattern = re.compile(".*".join(map(re.escape, name.split("*"))))
     found, refusals = [], [f"there is no drive {name!r}"]
-    for drive in drives:
+    for drive in drives.values():
         if pattern.fullmatch(drive.name):
             try:
                 found.append(_entry(key, drive, rest))
@@ -369,7 +367,7 @@ def _listed(plant: Plant, key: str, entry: object) -> list[str]:
 
 
 def _entry(key: str, drive: Drive, name: object) -> str:
-    """Return "drive.name". Raises ValueError if a table `may` cannot allow this register or verb."""
+    """Return "drive.name". Raises ValueError if it is impossible to allow this register or verb."""
     entry = f"{drive.name}.{name}"
     if key == "write":
         try:

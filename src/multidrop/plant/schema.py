@@ -204,7 +204,7 @@ def _polls_of(register: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _twice(name: str) -> dict[str, Any]:
-    """Return the condition that a list polls a register twice: by its name, and in a table."""
+    """Return the schema of a list `poll` with the same register twice: as a name, and in a table."""
     in_table = {"type": "object", "properties": {"register": {"const": name}}, "required": ["register"]}
     return {"allOf": [{"contains": {"const": name}}, {"contains": in_table}]}
 
@@ -213,7 +213,7 @@ def _twice(name: str) -> dict[str, Any]:
 
 
 def _used(name: str) -> dict[str, Any]:
-    """Return the part of the schema for a register that a channel of its drive uses: it must be polled."""
+    """Return the part of the schema that requires a register in `poll` if a channel of the drive uses it."""
     word = rf"^[^\"']*(?<![\w.-]){name}(?![\w.-]|\s*\()"
     uses = {"description": f"{name} is not in poll", "pattern": word}
     names = {"enum": ["*", name]}
@@ -231,7 +231,7 @@ def _used(name: str) -> dict[str, Any]:
 
 
 def _integrals(families: _Families) -> Iterator[dict[str, Any]]:
-    """Yield the parts of the schema for the possible units of channels that are integrals of one register."""
+    """Yield the parts of the schema for the unit of a channel whose value is `integral(register)`."""
     models: dict[tuple[str, str], list[str]] = {}
     for model, family in families.items():
         for register in family.readings():

@@ -72,11 +72,11 @@ class AddedRows:
         self._channels = ChannelSet(())
         # the codes of the drive and the register of each input slot
         self._codes: dict[int, tuple[int, int]] = {}
-        # by the codes of a drive and a register: the input slot; only for registers that channels use
+        # input slots of the registers that channels use, by (code of the drive, code of the register)
         self._slots: dict[tuple[int, int], int] = {}
         # the newest drive of each name; weak: a drive that was removed must not stay in memory
         self._drives: dict[str, ref[Drive]] = {}
-        # monotonic time since which rows of a drive count, if the name belonged to another drive before
+        # For a name that another drive had before: the monotonic time of the new drive's first row.
         self._since_ns: dict[str, int] = {}  # by drive name
         self._slot_since_ns: dict[int, int] = {}  # by slot
         self._events: list[AddedRow] = []

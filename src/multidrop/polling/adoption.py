@@ -120,9 +120,9 @@ class KeptLine:
     def await_stops(self) -> None:
         """Cancel the calls of the drives that leave the line, and wait for their stops.
 
-        With `stop_on_exit`, the leaving drives are stopped first. A drive whose address a new drive takes is
-        not stopped, because its stop could be a different command to the new drive. Drives are removed only
-        after all stops have ended: until then, every drive can be stopped again.
+        With `stop_on_exit`, the leaving drives are stopped first. A leaving drive is not stopped if a new
+        drive gets its address: its stop could be a different command to the new drive. Drives are removed
+        only after all stops have ended. Until then, every drive can be stopped again.
         """
         taken = {polled.drive.address for polled in self.joining}
         self.line.bus.part_with(self.leaving, [one for one in self.leaving if one.address not in taken])
@@ -237,9 +237,9 @@ class Adoption:
     def _change(self) -> dict[str, LineError]:
         """Change the kept lines one by one; return the errors of ports, by line name.
 
-        A drive may join a line while a drive of the same name leaves another line. Then the other line is
-        changed first. Lines that wait for each other are changed together, once all their stops are over. New
-        ports are opened only later, so that a slow port never delays the stop of a drive that is replaced.
+        If a drive that joins a line has the name of a drive that leaves another line, the other line is
+        changed first. If lines wait for each other in a circle, all of them are changed together, after their
+        stops have ended. New ports are opened later, because a slow port must not delay a stop.
         """
         failures: dict[str, LineError] = {}
         names = {polled.drive.name for polled in self._plant.drives}

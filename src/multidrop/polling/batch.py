@@ -68,9 +68,7 @@ def _library(name: str, extra: str, method: str) -> Any:
 
 
 TIMES = ("time", "monotonic_ns")
-# ns; a row belongs to another computer, or to a later start of the computer, if its monotonic time is earlier
-# than that of the row before by more than this, and its offset from UTC differs by more than this
-RESTART_NS = 60_000_000_000
+RESTART_NS = 60_000_000_000  # tolerance for detecting a restart of the computer, see `_is_restarted`
 
 
 class _WideColumn:
@@ -141,7 +139,7 @@ class WideRows(ArrowTable):
     def _column(
         self, owner: tuple[str, str], owners: dict[str, tuple[str, str]], are_chosen: bool
     ) -> _WideColumn | None:
-        """Return the column of a drive's register, new or existing; None if it is not chosen."""
+        """Return the column of a drive's register; None if other columns were chosen."""
         name = ".".join(owner)
         if owners.setdefault(name, owner) != owner:
             drives = " and ".join(repr(drive) for drive, _ in (owners[name], owner))
@@ -195,7 +193,11 @@ class WideRows(ArrowTable):
 
 
 def _is_restarted(before: tuple[int, int], now: tuple[int, int]) -> bool:
-    """Return True if the computer was restarted between two rows, given by time and monotonic time."""
+    """Return True if the computer was restarted, or changed, between two rows.
+
+    A row is given by its time and monotonic time. A restart sets the monotonic clock back, and changes its
+    offset from UTC, each by more than RESTART_NS.
+    """
     (time, monotonic_ns), (later, later_monotonic_ns) = before, now
     is_earlier = later_monotonic_ns < monotonic_ns - RESTART_NS
     return is_earlier and abs(later - later_monotonic_ns - time + monotonic_ns) > RESTART_NS
@@ -258,20 +260,21 @@ def shown_span(rows: Sequence[Row]) -> str:
 class BatchColumns(NamedTuple):
     """Columns of a batch as read-only one-dimensional memoryviews, without a copy.
 
-    Each column except `valid` has one number per row (shape `(len(batch),)`). A view keeps its memory
-    unchanged, even after the batch is deleted and the poller closed. So does an object that shares the
-    memory, such as `numpy.asarray(view)`. `drives`, `registers` and `statuses` are tuples of names; a code is
-    the index of its name. A name's code is the same in all batches of one poller; later batches may have more
-    names.
+    Each column except `valid` has one number per row (shape `(len(batch),)`). The memory of a view stays
+    valid and unchanged, even after the batch is deleted and the poller is closed. The same applies to an
+    object that shares the view's memory, such as `numpy.asarray(view)`.
+
+    `drives`, `registers` and `statuses` are tuples of names; a code is the index of its name. A name has the
+    same code in all batches of one poller. Later batches may have more names.
     """
 
     time: memoryview  # int64 (format "q"): UTC in ns at which the request was sent
     monotonic_ns: memoryview  # int64: the same moment by CLOCK_MONOTONIC, in ns
-    uncertainty_ns: memoryview  # int64; undefined for a miss
+    uncertainty_ns: memoryview  # int64; undefined if the value is missing
     drive: memoryview  # uint16 ("H"): a code in `drives`
     register: memoryview  # uint16: a code in `registers`
-    value: memoryview  # float64 ("d"), in the register's unit; undefined for a miss
-    status: memoryview  # uint16: a code in `statuses`; 0 is "ok", any other a miss
+    value: memoryview  # float64 ("d"), in the register's unit; undefined if it is missing
+    status: memoryview  # uint16: a code in `statuses`; 0 is "ok", any other: no value
     valid: memoryview  # uint8 ("B"), a bit for each row, least significant first: 1 if status is 0
     drives: tuple[str, ...]
     registers: tuple[str, ...]
@@ -464,7 +467,7 @@ def assemble(rows: int, *columns: tuple[Any, ...]) -> Any:
 
 
 class GatheredRows(CopiedColumns):
-    """Columns that grow by a copy of each batch, so that the core can reuse the batch's memory."""
+    """Copies of the rows of several batches. The core can then reuse the batches' memory."""
 
     def __init__(self, drives: Names, registers: Names) -> None:
         self._drives, self._registers = drives, registers
@@ -497,7 +500,7 @@ def gather(gathered: list[GatheredRows], batch: Batch) -> None:
 
 
 def copied(batch: Batch) -> Batch:
-    """Return a copy of the batch, so that the core can reuse the batch's memory."""
+    """Return a copy of the batch. The core can then reuse the batch's memory."""
     gathered: list[GatheredRows] = []
     gather(gathered, batch)
     return gathered[0].batch()

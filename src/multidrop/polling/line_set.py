@@ -25,7 +25,7 @@ from multidrop.transport.open_port import check_port
 OPENING = 32  # limit of ports that are opened concurrently
 ENDING_NS = 1_000_000_000  # how long the end of polling waits for in-flight exchanges
 NO_LINE = 0  # a number that no line has
-MOST_LINES = (1 << 16) - 1  # the highest line number of a row queue
+MOST_LINES = (1 << 16) - 1  # limit of lines, because the core numbers them from 1 to this
 
 
 class LineSet:
@@ -142,7 +142,7 @@ class LineSet:
             if self._mastership and not self._mastership.holds:
                 return self.await_port(line)
             return self._bus(Bus, line)
-        except OSError as failure:  # a LineError if the port failed, another OSError if the audit log did
+        except OSError as failure:  # of the port (LineError) or of the audit log
             return failure
 
     def await_port(self, line: PlantLine) -> Bus:
@@ -169,7 +169,7 @@ class LineSet:
             self._free.pop()
         self._numbered[number] = line
         self._lines = (*self._lines, line)
-        # checked after the line was added: if another thread sets the flag later, it finds the line
+        # Read after adding the line: another thread first sets this flag, then applies it to all added lines.
         if self.stops_on_exit:
             bus.stop_on_exit()
         return line

@@ -56,7 +56,7 @@ class Reopening:
             self._bus.note_reopening(False)
 
     def join(self) -> None:
-        """Wait until the current attempt, if any, is over."""
+        """Wait until the current attempt, if any, has ended."""
         if self._thread is not None:
             self._thread.join()
 
@@ -104,21 +104,21 @@ def _drive_summary(drive: Statistics, response_delay: float) -> dict[str, Any]:
     }
 
 
-LEARN_NS = 1_000_000_000  # interval between updates of exchange durations from measured response delays
-# interval between updates of exchange durations while the core repeats the bus cycle
-RELEARN_NS = 2_000_000_000
+LEARN_NS = 1_000_000_000  # interval at which durations and plans are adapted to measured response delays
+RELEARN_NS = 2_000_000_000  # the same, while the core repeats the bus cycle by itself
 REOPEN_NS = 500_000_000  # interval between attempts to reopen a lost port
-# Limit of losses without a reply in between after which the port is reopened at once. It is above one,
-# because some devices close each connection at one particular request.
+# A lost port is reopened immediately, unless it was lost more often than this without a reply in between.
+# The limit is above one, because some devices close each connection at one particular request.
 MOST_AT_ONCE = 2
 # time after the reopening of a lost port during which the requests of stops go before polls
 STOPS_FIRST_NS = 500_000_000
-# interval at which miss rows are added while this process may not poll the line
+# interval at which rows without a value are added while this process may not poll the line
 STANDBY_NS = 500_000_000
 RETRY_NS = 500_000_000  # pause before polling is retried after a failure; each further failure doubles it
 LONGEST_RETRY_NS = 30_000_000_000
 SOUND_NS = 10_000_000_000  # time without failures of polling after which earlier failures are forgotten
-# plan again if a response delay is outside the plan's best range by more than this fraction
+# A drive's requests are planned again if its response delay is outside the range of delays for which the plan
+# is the quickest. This is the relative tolerance of that range.
 MARGIN = 0.05
 
 
@@ -149,7 +149,7 @@ class PolledLine:
         self._planned: dict[PolledDrive, PlannedJobs] = {}
         self._present: dict[Drive, PolledDrive] = {}  # the drives on the line
         self._since_ns: dict[Drive, int] = {}  # when each drive's polls were last changed
-        # by address: the peer of a removed drive, with which an exchange may still be in flight
+        # the core's records of removed drives, by address: an exchange may still be in flight
         self._gone: dict[int, Peer] = {}
         self._polled: list[tuple[Drive, Peer]] = []  # the present drives that have jobs
         # for each drive in `_polled`: its failures, the end of its late replies, whether it has answered
@@ -198,12 +198,13 @@ class PolledLine:
         return {drive.name: since_ns for drive, since_ns in self._since_ns.copy().items()}
 
     def add(self, polled: PolledDrive) -> None:
-        """Start polling a drive. A drive that was polled before gets the same jobs again. Before that, wait
-        for the last exchange of an earlier drive at the same address. Until that exchange has ended, it is
-        unknown whether a late reply of the earlier drive is due.
+        """Start polling a drive. A drive that was polled before gets the same jobs again.
+
+        If another drive was removed from this address, first wait for the end of its last exchange. Only then
+        is it known whether a late reply of that drive may still come.
         """
         self.await_gone(polled.drive.address)
-        # called before taking the lock, for which polling waits: `require` may wait until a port is open
+        # not under the lock, which polling needs: `require` may wait until a port is open
         settings = polled.drive.settings
         self.bus.line.require((settings.baudrate, settings.format))
         with self._lock:
@@ -264,7 +265,7 @@ class PolledLine:
         self._row_queue.call(self.number)
 
     def forget(self, drive: Drive) -> None:
-        """Forget the jobs of a drive that was removed for good, but keep its peer (timing, late replies)."""
+        """Forget the jobs of a drive that was removed for good, but keep its timing and late replies."""
         with self._lock:
             self._planned = {each: jobs for each, jobs in self._planned.items() if each.drive is not drive}
             self._maker.forget_drive(drive)
@@ -305,8 +306,8 @@ class PolledLine:
         """
         present = self._jobs(drive)
         old = [job for job in present if job not in wanted]
-        # A new job is first due with the earliest of the old jobs that have the same period. Without such an
-        # old job, it is first due with the earliest of the present jobs that have the same period.
+        # The first due time of new jobs, by period: that of the earliest old job with this period. If there
+        # is no such job, it is that of the earliest present job.
         latest_first = [*sorted(present, key=_due, reverse=True), *sorted(old, key=_due, reverse=True)]
         dues = {job.period_ns: job.due_ns for job in latest_first}
         self._refusals.forget(drive)
@@ -344,14 +345,14 @@ class PolledLine:
         """Return True while the port is open, this process is the master, and all drives answer."""
         if self._queue.port is None or self._queue.port is not self.bus.line.queue:
             return False
-        is_asked = not self._schedule.unasked and not self._schedule.back_off.may_sleep(now_ns)
+        is_asked = not self._schedule.unasked and not self._schedule.back_off.has_pauses(now_ns)
         return is_asked and self.bus.line.may_send
 
     def tend(self, now_ns: int) -> None:
         """Process the results of queued exchanges, and queue the next ones.
 
         Never raises. A failure, such as one in a user's own class, is logged, and polling is retried later.
-        Until then the line's rows are misses with the status POLLING_FAILED.
+        Until then the line's rows have no values, and the status POLLING_FAILED.
         """
         if self._is_left:  # `close` may hold the lock until the port is closed
             return
@@ -373,7 +374,7 @@ class PolledLine:
     def _is_sound(self, now_ns: int) -> bool:
         """Return True if polling may continue after a failure.
 
-        While the next attempt is not due, return False and record each due value as a miss.
+        While the next attempt is not due, return False and record each due value as missing.
         """
         if self._is_broken:
             self._queue.abandon()
@@ -481,7 +482,7 @@ class PolledLine:
                 self._row_queue.add_miss(job.rows, why, due_ns)
 
     def _miss_unasked(self, now_ns: int) -> None:
-        """Add a miss row for each skipped slot that is now due; a slot may be skipped before it is due."""
+        """Add rows without a value for skipped slots that are now due; slots may be skipped in advance."""
         unasked = self._schedule.unasked
         if unasked:
             self._miss([slot for slot in unasked if slot[1] <= now_ns], Status.NOT_ASKED)
@@ -490,7 +491,7 @@ class PolledLine:
     # ---- lack of mastership, lost ports, and the end of polling ----
 
     def _stand_by(self, now_ns: int, why: Status) -> None:
-        """Instead of polling, every STANDBY_NS add a miss row for each value that has become due."""
+        """Instead of polling, every STANDBY_NS add a row without a value for each poll that was due."""
         if now_ns >= self._standby_ns:
             self._standby_ns = now_ns + STANDBY_NS
             self._miss(self._schedule.pass_all(now_ns), why)
@@ -505,9 +506,9 @@ class PolledLine:
             self._reopen_ns = now_ns
 
     def _regain(self, now_ns: int) -> None:
-        """Reopen the port in a thread; until that succeeds, add a miss row for each value that is due.
+        """Reopen the port in a thread; until that succeeds, add a row without a value for each due poll.
 
-        The first attempt adds no miss rows: if it succeeds, polling continues in the same slot.
+        The first attempt adds no such rows: if it succeeds, polling continues in the same slot.
         """
         if now_ns < self._reopen_ns or self._reopening.is_under_way:
             return
@@ -517,7 +518,7 @@ class PolledLine:
         self._reopening.begin()
 
     def leave(self) -> None:
-        """Stop tending the line. From now on, only stops reopen a lost port."""
+        """Make `tend` do nothing from now on. A lost port is then only reopened to send a stop."""
         with self._lock:
             self._is_left = True
 
@@ -530,18 +531,21 @@ class PolledLine:
         return self.bus.line.end()
 
     def close(self, why: str) -> None:
-        """Add miss rows for slots that ended unsent; close the bus. Later calls fail with text `why`."""
+        """Add rows without a value for polls that were not sent in time, then close the bus.
+
+        Later calls on the bus fail; `why` is part of their error sentence.
+        """
         self.bus.line.why_closing = why
         self.bus.line.ended_ns = self._ended_ns
         with self._lock:
             try:
-                self._miss_what_is_over(self._ended_ns or clock.now_ns())
+                self._miss_unsent(self._ended_ns or clock.now_ns())
                 self._over_ns = self._over_ns or clock.now_ns()
                 self._schedule.clear()
             finally:
                 self.bus.close()
 
-    def _miss_what_is_over(self, ended_ns: int) -> None:
+    def _miss_unsent(self, ended_ns: int) -> None:
         if self._is_broken:
             self._queue.abandon()
         self._miss_unasked(ended_ns)

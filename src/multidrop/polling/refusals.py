@@ -27,23 +27,28 @@ _log = logging.getLogger("multidrop.polling")
 
 
 class Refusals:
-    """One line's refused registers, which are polled rarely ("set aside"), and its split blocks."""
+    """The registers and blocks of one line that its drives refuse.
+
+    A refused register is set aside: it is polled rarely. A refused block is split into smaller ones.
+    """
 
     def __init__(self, schedule: Schedule[PolledJob], maker: JobMaker) -> None:
         self._schedule = schedule
         self._maker = maker
-        # the rare jobs in use, each with the normal job that it replaces
+        # the scheduled jobs with the long period SET_ASIDE_NS -> the normal jobs that they replace
         self._set_aside: dict[PolledJob, PolledJob] = {}
-        self._rare: dict[PolledJob, PolledJob] = {}  # the rare job that was made for each normal job
+        # normal jobs -> the jobs with the long period that were made for them; kept for reuse
+        self._rare: dict[PolledJob, PolledJob] = {}
         # for each part of a split job: the whole job as planned
         self._wholes: dict[PolledJob, PolledJob] = {}
         # for each retry of a split job: the whole job as planned
         self._trials: dict[PolledJob, PolledJob] = {}
-        self._probes: dict[int, PolledJob] = {}  # single-register jobs, by drive address
+        # jobs for drives that may only answer short requests: each reads a single register; by drive address
+        self._probes: dict[int, PolledJob] = {}
 
     @property
     def names(self) -> list[str]:
-        """Names, as DRIVE.REGISTER, of the registers that are set aside now."""
+        """Names, as DRIVE.REGISTER, of the refused registers, which are polled rarely."""
         return [
             f"{job.owner.name}.{register.name}" for job in self._set_aside for register in job.block.registers
         ]
@@ -136,7 +141,7 @@ class Refusals:
                 self._schedule.add(probe, now_ns)
 
     def _end_probes(self) -> None:
-        """End the single-register probes of drives whose blocks are all answered or split."""
+        """Remove the single-register jobs of drives without an unanswered block that may be too long."""
         doubtful = {
             job.drive for job in self._schedule.jobs if job.may_be_too_long and not job.rows.is_answered
         }

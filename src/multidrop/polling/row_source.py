@@ -137,7 +137,7 @@ class RowSource:
         self._names = names
         self._added = AddedRows(names)  # adds the rows of computed channels and of events
         self._wakeup = WakeUp()
-        self._is_watched = False  # True once `fileno` was called: its descriptor is then kept up to date
+        self._is_watched = False  # True once `fileno` was called: `_wakeup` must then show whether rows wait
         self._taken_ns = 0  # when rows were last taken from a chunk that was not full
         self._is_started = False  # True once polling has started
         self._closing = False

@@ -35,7 +35,7 @@ class _LineTime:
 
 
 def _lines(plan: RunPlan) -> list[_LineTime]:
-    """Return the lines with drives that the test commands or whose values it compares."""
+    """Return the lines that have at least one drive of the test."""
     found = [
         _LineTime(line, predict(planned_on(line), switching=line.switching)) for line in plan.plant.lines
     ]
@@ -43,9 +43,9 @@ def _lines(plan: RunPlan) -> list[_LineTime]:
 
 
 def longest_pause(plan: RunPlan) -> float:
-    """Return the longest planned time in s between two values of a drive that the test uses.
+    """Return the longest planned time in s between two values that the test needs.
 
-    Each compared register and each fault code counts separately.
+    It needs any value of each of its drives, a value of each register in a condition, and each fault code.
     """
     compared = {*plan.faults, *((condition.drive, condition.register) for condition in plan.conditions)}
     pauses = [one.prediction.cycle for one in _lines(plan)]

@@ -163,7 +163,7 @@ def _at_speed(plant: Plant, speed: float) -> Plant:
 
 
 class _RowThread:
-    """Calls `take` with batches of rows on a separate thread, so that limits and stops never wait for `take`.
+    """Calls `take` with batches of rows on a separate thread. So a slow `take` delays no abort and no stop.
 
     After the last batch, or an error of `take`, the thread calls `close`.
     """
@@ -255,7 +255,7 @@ class _Session:
     def _end_rows(self) -> list[str]:
         """Pass on the last rows and close the recording.
 
-        Return a sentence for the recording, and for each callback, that did not get all rows.
+        Return an error sentence for each receiver, the recording or a callback, that did not get all rows.
         """
         while self.take():  # pass on the rows that arrived while the poller was being closed
             pass
@@ -296,37 +296,37 @@ class _Session:
             self._run.number = number
             self._check_standstill()  # if the process was suspended, no further drive may be started
             self._mark(step.name)
-            works = [
+            commands = [
                 pool.submit(copy_context().run, self._command, self._poller[name], step)
                 for name in step.drives
             ]
-            at = self._follow(works, at + planned.seconds, step)
+            at = self._follow(commands, at + planned.seconds, step)
 
-    def _follow(self, works: list[Future[Any]], over: float = 0.0, step: RunStep | None = None) -> float:
-        """Wait for the commands `works`, for the planned end `over`, and for the step's condition.
+    def _follow(self, commands: list[Future[Any]], end: float = 0.0, step: RunStep | None = None) -> float:
+        """Wait until all commands are done, the planned end has passed, and the step's condition holds.
 
-        Return when the next step is due. Both times are in s since the run's start. Raises _Aborted at a
-        limit, and if a command fails.
+        Return when the next step is due. This time and `end` are in s since the run's start. Raises _Aborted
+        at a limit, and if a command fails.
         """
         since_ns, is_late = clock.now_ns(), False
         until = step.until if step else None
         while True:
-            self._look(works)
+            self._look(commands)
             now = self._run.elapsed
-            is_done = all(work.done() for work in works)
-            is_late |= now >= over + LATE_S * self._run._speed  # for example on a busy computer
-            if now >= over and is_done:
+            is_done = all(command.done() for command in commands)
+            is_late |= now >= end + LATE_S * self._run._speed  # for example on a busy computer
+            if now >= end and is_done:
                 if until is None:
-                    return now if is_late else over
+                    return now if is_late else end
                 if self._watch.holds(until, since_ns):
                     return now
-                if step and now >= over + step.within:
+                if step and now >= end + step.within:
                     raise _Aborted(f"{step.name}: {until.text} did not hold within {step.within:g} s")
-            is_late |= now >= over and not is_done
+            is_late |= now >= end and not is_done
             pause = LOOK_S * self._run._speed
-            clock.sleep(min(pause, over - now) if over > now else pause)
+            clock.sleep(min(pause, end - now) if end > now else pause)
 
-    def _look(self, works: list[Future[Any]]) -> None:
+    def _look(self, commands: list[Future[Any]]) -> None:
         """Take one batch of rows, and check limits, commands and callbacks.
 
         Raises _Aborted if a limit is reached, if a command has failed, or if rows were lost. Raises the error
@@ -343,8 +343,8 @@ class _Session:
         duration = self._plan.limits.duration
         if duration is not None and self._run.elapsed > duration:
             raise _Aborted(f"the run took longer than its duration, {duration:g} s")
-        for work in works:
-            failure = work.exception() if work.done() else None
+        for command in commands:
+            failure = command.exception() if command.done() else None
             if isinstance(failure, (BusError, ValueError, TypeError)):
                 raise _Aborted(str(failure)) from failure
             if failure is not None:

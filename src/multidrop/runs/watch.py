@@ -25,7 +25,7 @@ class LimitWatch:
         self._newest: dict[str, dict[str, Row]] = {name: {} for name in self._drives}
         # newest value of each fault record, by drive and register
         self._records: dict[tuple[str, str], float] = {}
-        # when the newest value of each drive name or "drive.register" came (monotonic, in ns)
+        # monotonic times in ns of the newest values, by drive name and by "drive.register"
         self._heard = dict.fromkeys(self._drives, begin_ns)
         limited = [(limit.drive, limit.register) for limit in self._limits]
         self._heard |= {f"{name}.{register}": begin_ns for name, register in (*limited, *plan.faults)}

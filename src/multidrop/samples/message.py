@@ -4,10 +4,10 @@
 |------------------|-----------------------------|------------------------------------------------------|
 | `time`           | timestamp[ns, UTC]          | when the request was sent                            |
 | `clock_ns`       | int64                       | time - monotonic_ns: nearly the same in all rows     |
-| `uncertainty_us` | int32, null for a miss      | the value was taken between time and this much later |
+| `uncertainty_us` | int32, null if missing      | the value was taken between time and this much later |
 | `drive`          | dictionary of utf8          | the drive's name                                     |
 | `register`       | dictionary of utf8          | the register's name                                  |
-| `value`          | float64, null for a miss    | in `unit`                                            |
+| `value`          | float64, null if missing    | in `unit`                                            |
 | `status`         | dictionary of utf8          | `ok`, or why there is no value                       |
 | `unit`           | dictionary of utf8, or null | see below; null if unknown                           |
 
@@ -54,8 +54,8 @@ _NOT_COMPRESSED = -1
 MOST_BYTES = 900_000  # size limit of a message; NATS accepts 1 MiB by default, including headers
 MOST_ROWS = 1 << 16
 MOST_UNPACKED = 4 << 20  # limit of the unpacked size in bytes; enough for 2.4 MB of rows and their names
-# limit of a name, status or unit in bytes, because PostgreSQL indexes names: an index entry has at most 2704
-# bytes, and the text of an event has at most 500 characters of 4 bytes
+# Limit of a name, status or unit, in bytes. PostgreSQL indexes names, and an index entry has at most 2704
+# bytes. Texts of events are allowed: they have at most 500 characters of 4 bytes.
 MOST_NAME = 2000
 MOST_SAID = 300  # limit, in characters, of an error's text
 LONGEST_US = (1 << 31) - 1

@@ -12,7 +12,7 @@ from multidrop.drive import Drive
 from multidrop.drive.register import Register
 from multidrop.plant.model import PlantLine
 
-RAW = "raw count"  # unit of values whose scale is unknown, as in a `History`
+RAW = "raw count"  # unit of values whose scale is unknown; histories use the same text
 
 
 class UnitChange(NamedTuple):

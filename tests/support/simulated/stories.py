@@ -94,7 +94,7 @@ class Story:
     def back_off_is_over(self) -> int:
         """Run until every drive was polled again after the fault; return that time in ns."""
         cost = sum(drive.response_timeout for drive in self.drives) / 2  # s of timeouts per cycle, on average
-        longest = max(schedule.LONGEST_REST_NS / S, cost / schedule.SILENT_SHARE)
+        longest = max(schedule.LONGEST_PAUSE_NS / S, cost / schedule.SILENT_SHARE)
         longest += Faults().away + polled_line.REOPEN_NS / S + poller.LOOK_NS / S
         ended = self.clocked.now
         asked: dict[str, int] = {}
