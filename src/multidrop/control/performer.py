@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from typing import Any, cast
 
-from multidrop.control.call import Call, Latches, present_limit_ns
+from multidrop.control.call import MOST_EXPIRY_S, Call, Latches, check_expiry, present_limit_ns
 from multidrop.control.exit_hook import await_signal
 from multidrop.control.outcome import Outcome
 from multidrop.control.records import check_author
@@ -15,11 +15,12 @@ from multidrop.control.rules import check_broadcast, check_plain, is_harmless, i
 from multidrop.control.stops import Stopper
 from multidrop.control.writer import Writer
 from multidrop.core import Framing, Message
-from multidrop.drive.family import Drive
+from multidrop.drive.family import Drive, check_own, check_own_text
 from multidrop.drive.register import Register
 from multidrop.drive.request import check_no_read
 from multidrop.drive.state import State
-from multidrop.drive.verbs import Insist, Read, Script, Step, Wait, Write, carry_out
+from multidrop.drive.text import Text
+from multidrop.drive.verbs import CalledStop, Insist, Read, Script, Step, Wait, Write, carry_out
 from multidrop.errors import BusError, CancelledByStop, DriveException, Unconfirmed, WriteForbidden
 from multidrop.transport import clock
 from multidrop.transport.exchange import READ_FAILURES, Exchanges
@@ -208,6 +209,65 @@ def _unseen(call: Call, why: Exception) -> Unconfirmed:
     else:
         reason = f"it was sent, and its effect could not be seen: {why}"
     return Unconfirmed(call.drive.name, call.sent or f"the {call.verb}", reason)
+
+
+# ---- requests from the methods of drives ----
+
+
+class BusLink:
+    """Carries out the reads, writes and stops that the methods of a bus's drives request."""
+
+    def __init__(self, exchanges: Exchanges, performer: Performer, stopper: Stopper) -> None:
+        self._exchanges = exchanges
+        self._performer = performer
+        self._stopper = stopper
+
+    def values(self, drive: Drive, registers: tuple[Any, ...]) -> dict[str, Any]:
+        try:
+            return self._exchanges.read(drive, registers)
+        except TypeError:  # an unhashable argument cannot be a register
+            for register in registers:
+                if not isinstance(register, str):
+                    check_own(drive, register)
+            raise
+
+    def text(self, drive: Drive, text: Text) -> str:
+        check_own_text(drive, text)
+        return self._exchanges.read_text(drive, text)
+
+    def write(self, drive: Drive, register: Register[Any], value: Any) -> Outcome:
+        return self._performer.write(drive, register, value)
+
+    def read_raw(
+        self,
+        drive: Drive,
+        function: int,
+        start: int,
+        count: int,
+        expiry: float = MOST_EXPIRY_S,
+        attempts: int = 1,
+    ) -> bytes:
+        check_expiry(expiry)
+        return self._exchanges.ask(drive, function, start, count, expiry, attempts)
+
+    def send_raw(self, drive: Drive, function: int, start: int, data: bytes, count: int) -> bytes:
+        if not isinstance(data, bytes | bytearray):
+            raise TypeError(f"data = {data!r}: it must be bytes, such as b'\\x00\\x01'")
+        return self._performer.raw(drive, Message(drive.address, function, start, count, data))
+
+    def perform(self, drive: Drive, script: Script[Any]) -> Any:
+        return self._performer.perform(script, self._performer.call(drive))
+
+    def begin_call(self, drive: Drive, verb: str, seen: int) -> Call:
+        return self._performer.call(drive, verb, seen)
+
+    def carry_out_move(self, drive: Drive, script: Script[Any], call: Call) -> Any:
+        return self._performer.move(script, call)
+
+    def begin_stop(
+        self, drive: Drive, verb: str, make: Callable[[], Script[Any]], seconds: float | None
+    ) -> CalledStop:
+        return self._stopper.stop(drive, verb, make, seconds)
 
 
 # ---- broadcasts ----
