@@ -1,8 +1,6 @@
 /* The functions of ports for clients, on any thread. */
-#define _GNU_SOURCE
 #include "engine.h"
 
-#include <errno.h>
 #include <stdlib.h>
 
 static struct md_port *new_port(unsigned room)

@@ -185,15 +185,12 @@ enum { HEAD = 6 };
 /* Read the first bytes of the body; bytes that have not come yet count as 0. */
 static void read_head(int framing, const uint8_t *bytes, size_t len, uint8_t head[HEAD])
 {
+    int is_text = framing == MD_ASCII || framing == MD_DELIXI;
+    size_t from = framing == MD_TCP ? MD_TCP_HEAD : 0;
     memset(head, 0, HEAD);
-    if (framing == MD_TCP) {
-        for (size_t i = 0; i < HEAD && MD_TCP_HEAD + i < len; i++)
-            head[i] = bytes[MD_TCP_HEAD + i];
-        return;
-    }
-    for (size_t i = 0; framing == MD_RTU && i < HEAD && i < len; i++) /* memcpy() would be slower */
-        head[i] = bytes[i];
-    for (size_t i = 0; framing != MD_RTU && i < HEAD && 2 * i + 2 < len; i++) {
+    for (size_t i = 0; !is_text && i < HEAD && from + i < len; i++) /* memcpy() would be slower */
+        head[i] = bytes[from + i];
+    for (size_t i = 0; is_text && i < HEAD && 2 * i + 2 < len; i++) {
         int byte = md_hex_byte(bytes + 2 * i + 1);
         if (byte < 0)
             return;

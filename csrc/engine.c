@@ -1,9 +1,7 @@
 /* The thread that runs every line of the process. It never takes Python's interpreter lock, so polling
  * continues whatever Python's threads do. */
-#define _GNU_SOURCE
 #include "engine.h"
 
-#include <errno.h>
 #include <sched.h>
 #include <signal.h>
 #include <stdlib.h>

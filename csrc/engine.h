@@ -6,8 +6,6 @@
 #include "line.h"
 
 #include <errno.h>
-#include <pthread.h>
-#include <stdint.h>
 #include <sys/types.h>
 
 enum { MD_WRONG_COUNTS = 3 }; /* after so many wrong counts of unsent bytes, the driver's count is ignored */

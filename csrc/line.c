@@ -43,9 +43,8 @@ int md_listen_begin(struct md_line *line, int64_t now_ns, int64_t guard_ns)
     if (line->state != MD_READY || (line->transactions && !guard_ns))
         return 0;
     md_line_go(line, MD_STRAY_BYTES);
-    line->listen_ns = longest * exchange->character_ns + exchange->drive->most_timeout_ns;
-    if (line->transactions)
-        line->listen_ns = 0;
+    int64_t listen_ns = longest * exchange->character_ns + exchange->drive->most_timeout_ns;
+    line->listen_ns = line->transactions ? 0 : listen_ns;
     line->listened_ns = now_ns + later(line->listen_ns, guard_ns);
     line->give_up_ns = line->listened_ns + line->listen_ns;
     return 1;
@@ -71,25 +70,16 @@ static int end_listening(struct md_line *line, int64_t now_ns)
 
 /* ---- results of an exchange: bytes for the tap, the completion, counters of the drive and the block ---- */
 
-/* Return 1 if the result means that the drive is silent or unreachable; 0 after a damaged reply, because the
- * drive did answer. */
+/* Return 1 if the result shows that the drive is silent or unreachable. A damaged reply does not: the drive
+ * did answer. */
 static int is_failure(int result)
 {
-    switch (result) {
-    case MD_BAD_CHECKSUM:
-    case MD_BAD_CHARACTER:
-    case MD_LATE_ANSWER_DUE:
-    case MD_MAYBE_ECHO:
-    case MD_EXPIRED:
-    case MD_LINE_LOST:
-    case MD_POLL_ENDED:
-    case MD_NOT_MASTER:
-    case MD_OTHER_MASTER:
-    case MD_STALLED:
-        return 0;
-    default:
-        return result < 0;
-    }
+    static const uint8_t is_exempt[MD_STATUSES] = {
+        [-MD_BAD_CHECKSUM] = 1, [-MD_BAD_CHARACTER] = 1, [-MD_LATE_ANSWER_DUE] = 1, [-MD_MAYBE_ECHO] = 1,
+        [-MD_EXPIRED] = 1,      [-MD_LINE_LOST] = 1,     [-MD_POLL_ENDED] = 1,      [-MD_NOT_MASTER] = 1,
+        [-MD_OTHER_MASTER] = 1, [-MD_STALLED] = 1,
+    };
+    return result < 0 && !is_exempt[-result];
 }
 
 static void count_reply(struct md_block *block, uint8_t exception)

@@ -1,5 +1,4 @@
 /* One port on the engine's thread: it reads, writes and switches settings until it must wait. */
-#define _GNU_SOURCE
 #include "engine.h"
 
 enum {

@@ -2,7 +2,6 @@
  *
  * The thread never waits for a client: rows collect in a bounded number of chunks. The thread holds the
  * lock while it adds one exchange's rows, a client while it removes a chunk. */
-#define _GNU_SOURCE
 #include "internal.h"
 
 #include <stdlib.h>
@@ -18,8 +17,7 @@ struct md_row_queue {
     size_t first, count;        /* index of the oldest chunk with rows; number of chunks with rows */
     struct md_columns *spare[MOST_SPARE]; /* empty chunks that clients gave back */
     size_t spares;
-    size_t lent;                /* number of chunks that clients hold, plus ports that report to the queue */
-    int is_done;                /* the client has freed the queue */
+    size_t holders;             /* the client, chunks that it holds, and ports that report to the queue */
     uint64_t dropped;
     uint64_t called[WORDS];     /* one bit for each port number that was called */
     uint32_t calls;             /* number of bits that are set in `called` */
@@ -69,6 +67,7 @@ struct md_row_queue *md_row_queue_new(size_t chunk_rows, size_t most_chunks)
     queue->chunks = chunks;
     queue->chunk_rows = chunk_rows;
     queue->most_chunks = most_chunks;
+    queue->holders = 1;
     md_mutex_init(&queue->mutex);
     init_condition(&queue->is_called);
     return queue;
@@ -89,14 +88,14 @@ static void destroy(struct md_row_queue *queue)
 void md_row_queue_hold(struct md_row_queue *queue)
 {
     pthread_mutex_lock(&queue->mutex);
-    queue->lent++;
+    queue->holders++;
     pthread_mutex_unlock(&queue->mutex);
 }
 
 void md_row_queue_release(struct md_row_queue *queue)
 {
     pthread_mutex_lock(&queue->mutex);
-    int is_last = --queue->lent == 0 && queue->is_done;
+    int is_last = --queue->holders == 0;
     pthread_mutex_unlock(&queue->mutex);
     if (is_last)
         destroy(queue);
@@ -105,12 +104,7 @@ void md_row_queue_release(struct md_row_queue *queue)
 /* A chunk or a port may outlive its queue: a garbage collector frees them in any order. */
 void md_row_queue_free(struct md_row_queue *queue)
 {
-    pthread_mutex_lock(&queue->mutex);
-    queue->is_done = 1;
-    int is_last = queue->lent == 0;
-    pthread_mutex_unlock(&queue->mutex);
-    if (is_last)
-        destroy(queue);
+    md_row_queue_release(queue);
 }
 
 /* ---- rows ---- */
@@ -184,7 +178,7 @@ struct md_columns *md_row_queue_take(struct md_row_queue *queue)
         chunk = queue->chunks[queue->first];
         queue->first = (queue->first + 1) % queue->most_chunks;
         queue->count--;
-        queue->lent++;
+        queue->holders++;
     }
     pthread_mutex_unlock(&queue->mutex);
     return chunk;

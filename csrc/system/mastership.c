@@ -5,7 +5,6 @@
  * works without the process, and the kernel can kill a suspended process. */
 #include "engine.h"
 
-#include <errno.h>
 #include <signal.h>
 #include <stdlib.h>
 

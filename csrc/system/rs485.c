@@ -7,7 +7,6 @@
  *
  * A USB adapter's report may be older than the request. The driver's queue is empty once the adapter has the
  * bytes, but then these bytes still take their whole time on the wire. */
-#define _GNU_SOURCE
 #include "engine.h"
 
 static const int64_t LOOK_AGAIN_NS = 200000;
