@@ -16,11 +16,11 @@ from simulated_bus import SimulatedBus, one
 from multidrop.control.ramp import start_staggered
 from multidrop.control.records import noted_first, read_audit, written_by
 from multidrop.core import Completion, Exchange
+from multidrop.core.process import flush_log
 from multidrop.drive import Condition
 from multidrop.errors import BusError, DriveException, LineError, Unconfirmed, WriteForbidden
 from multidrop.families import YD1000, InvtCHE
 from multidrop.families.invt_che import CHEControl
-from multidrop.transport.aside_log import flush
 
 
 def test_a_refused_raw_request_is_recorded_as_refused(tmp_path: Path) -> None:
@@ -66,7 +66,7 @@ def test_a_stop_is_sent_even_if_the_audit_log_cannot_be_written(caplog: pytest.L
     line, drive, _ = one(InvtCHE(1), audit="/dev/full")
     drive.stop()
     line.bus.close()
-    flush(60)
+    flush_log(60)
     assert [each[:17] for each in line.written] == ["01 06 10 00 00 05"]
     assert "the audit log cannot be written" in caplog.text
 

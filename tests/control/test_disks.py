@@ -22,10 +22,10 @@ from multidrop.control.eeprom_ledger import Ledger, LedgerCell
 from multidrop.control.outcome import Effect
 from multidrop.control.records import AuditLog, noted_first, read_audit, written_by
 from multidrop.core import Message
+from multidrop.core.process import flush_log
 from multidrop.errors import Unconfirmed, WriteForbidden
 from multidrop.families import DelixiModbus, ErmanERG220, InvtCHE
 from multidrop.sim import simulated
-from multidrop.transport.aside_log import flush
 
 CELL = LedgerCell("/dev/ttyUSB0", 1, "delixi-modbus", "frequency")
 HOUR = 3600.0
@@ -116,7 +116,7 @@ def test_stops_are_sent_despite_a_full_disk(tmp_path: Path, caplog: pytest.LogCa
     with full_at(path.stat().st_size + 50):
         drive.stop()
         line.bus._records.flush(PATIENCE_S)
-    flush(PATIENCE_S)
+    flush_log(PATIENCE_S)
     assert not sim.motor.energised
     assert "the audit log cannot be written: " in caplog.text
     assert line.bus.audit_trouble == "File too large"  # the error of the full disk that `full_at` simulates

@@ -16,11 +16,11 @@ from simulated_bus import SimulatedBus, one
 from stop_frames import che_drives
 
 from multidrop.core import Message
+from multidrop.core.process import flush_log
 from multidrop.drive import Drive
 from multidrop.errors import CancelledByStop, NotAttached, PortLost
 from multidrop.families import InvtCHE
 from multidrop.sim import simulated
-from multidrop.transport.aside_log import flush
 
 
 class RunningPair:
@@ -80,7 +80,7 @@ def test_stop_on_exit_stops_detached_drives(pair: RunningPair, caplog: pytest.Lo
 
     pair.line.fails = lambda request: PortLost("hall", "there is no such port")
     pair.bus.part_with([second], [second])
-    flush(60)
+    flush_log(60)
     told = [record.getMessage() for record in caplog.records if record.name == "multidrop.bus"]
     assert len(told) == 1
     assert told[0].startswith("invt-che@2: failed after 30")  # no stop was sent to this drive

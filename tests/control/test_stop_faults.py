@@ -34,12 +34,12 @@ from multidrop.control.ramp import start_staggered
 from multidrop.control.records import WriteRecords
 from multidrop.control.stops import LEAST_S, StopAttempt, stop_together
 from multidrop.core import Completion, Exchange
+from multidrop.core.process import flush_log
 from multidrop.drive import Drive, Script, carry_out, insist, read, until, verb, wait, write
 from multidrop.errors import CancelledByStop, Unconfirmed, WriteForbidden
 from multidrop.families import InvtCHE
 from multidrop.sim import MotorDrive, simulated
 from multidrop.transport import clock
-from multidrop.transport.aside_log import flush
 
 STOPPING = ramp._stop.__code__
 NO_MEMORY, NO_DESCRIPTORS = MemoryError(), OSError(EMFILE, "Too many open files")
@@ -309,7 +309,7 @@ def test_a_repeated_stop_opens_a_locked_eeprom_ledger_only_once(
         held.setattr(eeprom_ledger, "sqlite3", SimpleNamespace(connect=busy, Error=sqlite3.Error))
         line.bus.stop_all()
         line.bus._records.flush(60)
-    flush(60)
+    flush_log(60)
     assert 1 <= asked <= 2  # at the end of each stop, or once for both stops
     assert "stops were not counted: " in caplog.text
     before, asked_before = len(line.written), asked
@@ -325,7 +325,7 @@ def test_stop_is_sent_if_the_port_name_is_not_text(tmp_path: Path, caplog: pytes
     line.attach(Fan(1)).stop()
     assert len(line.written) == 1
     line.bus._records.flush(60)
-    flush(60)
+    flush_log(60)
     assert "stops were not counted: " in caplog.text
 
 

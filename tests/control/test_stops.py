@@ -22,6 +22,7 @@ from multidrop.control.outcome import UNSEEN, Seen
 from multidrop.control.ramp import ramp, start_staggered
 from multidrop.control.stops import AT_ONCE, LEAST_S, PAUSE_S
 from multidrop.core import Completion, Exchange, Message
+from multidrop.core.process import flush_log
 from multidrop.drive import Condition, Drive, Script, read, wait, write
 from multidrop.drive.register import reading
 from multidrop.drive.verbs import verb
@@ -29,7 +30,6 @@ from multidrop.errors import BusError, CancelledByStop, DriveException, LineErro
 from multidrop.families import YD1000, DelixiModbus, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.sim import simulated
 from multidrop.transport import clock
-from multidrop.transport.aside_log import flush
 
 every_family = pytest.mark.parametrize("model", MAKE)
 
@@ -212,7 +212,7 @@ def test_an_invalid_stop_time_is_ignored(caplog: pytest.LogCaptureFixture, stops
     else:
         getattr(drive, stops)(seconds=seconds)
     assert not sim.motor.energised
-    flush(60)
+    flush_log(60)
     assert (
         "is not a time for a stop: the stop is repeated for at least 30 s, as without this argument"
         in caplog.text
@@ -327,7 +327,7 @@ def test_the_repetition_and_the_end_of_a_stop_are_logged_once(caplog: pytest.Log
     deaf_until = line.seconds + 20
     line.deafens = lambda request: line.seconds < deaf_until
     drive.stop()
-    flush(60)
+    flush_log(60)
     told = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
     assert len(told) == 1
     assert told[0].startswith("the stop is repeated for 30 s at least: invt-che@1: it is not known whether")
@@ -486,7 +486,7 @@ def test_a_stop_is_sent_without_a_writable_ledger(tmp_path: Path, caplog: pytest
     found = line.bus.stop_all()
     assert [each.seen for each in found.values()] == [Seen.STOPPED] * 2
     line.bus.close()
-    flush(60)
+    flush_log(60)
     assert "stops were not counted" in caplog.text
 
 
@@ -706,6 +706,6 @@ def test_a_stop_of_a_whole_line_skips_a_device_without_a_motor(
     assert (str(results["meter"]), results["meter"].ok) == ("meter: has no motor", True)
     assert str(stop_drive(meter, None)["meter"].outcome) == "done"
     line.bus.close()
-    flush(1.0)
+    flush_log(1.0)
     assert not [request for request, _ in line.frames if request.address == 2]
     assert caplog.text == ""

@@ -149,7 +149,7 @@ import logging, os, resource
 from contextlib import suppress
 from multidrop import Plant, Poller
 from multidrop.core import Realtime, wake_lateness
-from multidrop.transport import aside_log
+from multidrop.core import process
 logging.basicConfig(format="%(message)s")
 resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
 if os.geteuid() == 0:
@@ -166,7 +166,7 @@ with Poller(Plant(()), realtime=True) as poller:
         with suppress(ProcessLookupError):  # this thread has just ended
             policies.add(os.sched_getscheduler(int(thread)))
     print(policies)
-aside_log.flush(10)
+process.flush_log(10)
 """
     run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert run.stdout.splitlines() == ["refused", "refused", str({os.SCHED_OTHER})], run.stderr

@@ -16,6 +16,7 @@ from toy import Toy
 
 from multidrop import PollingFailed
 from multidrop.core import Port, RowQueue
+from multidrop.core.process import flush_log
 from multidrop.drive import Drive
 from multidrop.poller import Poller
 from multidrop.polling import polled_line
@@ -23,7 +24,6 @@ from multidrop.polling.batch import Batch, Row
 from multidrop.polling.jobs import PortQueue
 from multidrop.sim import EncodedDrive, Simulator, Wire, proof, simulated
 from multidrop.transport import clock
-from multidrop.transport.aside_log import flush
 from multidrop.transport.network_port import Bridge
 
 FAILED = "not asked: polling failed"
@@ -201,7 +201,7 @@ def failed(two: Two, monkeypatch: pytest.MonkeyPatch) -> Two:
     monkeypatch.setattr(RowQueue, "await_calls", two.fails)
     two.poller._call_thread()
     until(lambda: two.poller.failure and not two.poller._thread.is_alive())
-    flush(PATIENCE)
+    flush_log(PATIENCE)
     two.poller._is_failure_raised = True  # so that `close` does not raise in the fixture
     return two
 

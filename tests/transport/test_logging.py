@@ -16,10 +16,11 @@ from simulated_bus import one
 from toy import PatientToy
 
 from multidrop import Bus, LineError, WriteForbidden
+from multidrop.core import process
+from multidrop.core.process import flush_log
 from multidrop.families import InvtCHE
 from multidrop.sim import SimulatedDrive, Simulator, Wire
-from multidrop.transport import aside_log, clock
-from multidrop.transport.aside_log import flush
+from multidrop.transport import clock
 from multidrop.transport.line import MOST_LOSSES, LineLog
 
 pytestmark = pytest.mark.usefixtures("_patient")
@@ -45,7 +46,7 @@ def test_a_port_that_was_never_open_is_not_logged(caplog: pytest.LogCaptureFixtu
         bus = Bus.awaiting(str(tmp_path / "port"))
         with pytest.raises(LineError):
             bus.line.regain()
-        flush(PATIENCE)
+        flush_log(PATIENCE)
         bus.close()
     first = messages(caplog, "multidrop.line")[0]
     assert first == ("WARNING", f"{tmp_path}/port: not opened: there is no such port")
@@ -72,7 +73,7 @@ def test_losing_and_reopening_a_port_is_logged_once(caplog: pytest.LogCaptureFix
                 drive.read(drive.output_current)
         ends = plugged_in()
         bus.line.regain()
-        flush(PATIENCE)
+        flush_log(PATIENCE)
         for end in ends:
             os.close(end)
     levels = [
@@ -96,7 +97,7 @@ def test_frequent_losses_of_a_port_do_not_fill_the_log(
         log.lost("hung up")
         log.unopened("nothing listens there")
         log.opened("port")
-        flush(PATIENCE)
+        flush_log(PATIENCE)
     told = [text for _, text in messages(caplog, "multidrop.line")]
     assert len(told) == 2 * MOST_LOSSES * 3 + 2
     assert told[:2] == ["port: lost (hung up)", "port: opened again (port)"]
@@ -115,7 +116,7 @@ def test_frames_are_logged_only_at_level_debug(caplog: pytest.LogCaptureFixture)
         assert messages(caplog, "multidrop.line") == []
         with caplog.at_level(logging.DEBUG, "multidrop"):
             drive.read(drive.output_current)
-            flush(PATIENCE)
+            flush_log(PATIENCE)
     (_, request), (_, reply) = messages(caplog, "multidrop.line")[:2]
     assert request.startswith(f"{bus.line.port} > ")
     frame = checksums.rtu("01 03 00 02 00 01").hex(" ").upper()
@@ -133,7 +134,7 @@ def test_every_write_every_refusal_and_every_stop_is_logged(caplog: pytest.LogCa
         with pytest.raises(WriteForbidden):
             drive.write(drive.register("setpoint"), 1e6)
         bus.stop_all()
-        flush(PATIENCE)
+        flush_log(PATIENCE)
     told = [text for _, text in messages(caplog, "multidrop.control")]
     assert any(text.startswith("pump-1: ") and text.endswith(": done") for text in told)
     assert any(text.startswith("pump-1: stopped after ") for text in told)
@@ -169,16 +170,16 @@ def test_a_stop_is_repeated_although_a_log_handler_hangs() -> None:
 
 
 def test_the_queue_of_a_log_handler_that_hangs_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    aside = aside_log.AsideThread("log")
-    monkeypatch.setattr(aside_log, "_log_thread", aside)
+    aside = process.AsideThread("log")
+    monkeypatch.setattr(process, "_log_thread", aside)
     handler, logger = Hanging(), logging.getLogger("multidrop.line")
     logger.addHandler(handler)
     try:
-        aside_log.log_aside(logger, logging.WARNING, "the first record")
+        process.log_aside(logger, logging.WARNING, "the first record")
         assert handler.has_begun.wait(PATIENCE)
-        for number in range(2 * aside_log.MOST_WAITING):
-            aside_log.log_aside(logger, logging.WARNING, "%d", number)
-        assert aside._work.qsize() == aside_log.MOST_WAITING
+        for number in range(2 * process.MOST_WAITING):
+            process.log_aside(logger, logging.WARNING, "%d", number)
+        assert aside._work.qsize() == process.MOST_WAITING
     finally:
         handler.released.set()
         logger.removeHandler(handler)

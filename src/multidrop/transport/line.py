@@ -22,11 +22,10 @@ from multidrop.core import (
     TransactionIds,
     build_request,
 )
-from multidrop.core.process import register_at_fork, undisturbed
+from multidrop.core.process import flush_log, log_aside, register_at_fork, undisturbed, words_of
 from multidrop.drive.line_settings import check_settle, speaks_tcp
 from multidrop.errors import LineError, NoSuchPort, PortLost
 from multidrop.transport import clock
-from multidrop.transport.aside_log import flush, log_aside, words_of
 from multidrop.transport.network_port import PORT_FAILURES
 from multidrop.transport.open_port import (
     CLOSING_S,
@@ -268,7 +267,7 @@ class Line:
                 self._log.closed()
             self._is_over = True
             self._let_go()
-        flush(LOGGING_S)
+        flush_log(LOGGING_S)
 
     def end(self) -> bool:
         """Start no more queued exchanges. Return True while a queued exchange is in flight."""
