@@ -697,6 +697,8 @@ class Meter(Drive):
 def test_a_stop_of_a_whole_line_skips_a_device_without_a_motor(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
+    flush_log(60)  # records of earlier tests
+    caplog.clear()
     line = SimulatedBus(simulated(YD1000(1)), simulated(Meter(2)))
     line.attach(YD1000(1, name="pump"))
     meter = line.attach(Meter(2, name="meter"))
