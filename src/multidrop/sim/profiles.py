@@ -6,6 +6,23 @@ from collections.abc import Mapping
 from typing import Any
 
 from multidrop.drive.family import Drive
+from multidrop.families.profiles.command_bits import (
+    CiA402,
+    CiA402Control,
+    CiA402Status,
+    DanfossControl,
+    DanfossFC,
+    DanfossStatus,
+    Optidrive,
+    OptidriveControl,
+    OptidriveStatus,
+    Profidrive,
+    ProfidriveControl,
+    ProfidriveStatus,
+    Yaskawa,
+    YaskawaControl,
+    YaskawaStatus,
+)
 from multidrop.families.profiles.command_codes import (
     FORWARD,
     REVERSE,
@@ -20,25 +37,6 @@ from multidrop.families.profiles.command_codes import (
     Invt,
     InvtControl,
     InvtStatus,
-)
-from multidrop.families.profiles.iec_61800_7 import (
-    CiA402,
-    CiA402Control,
-    CiA402Status,
-    Profidrive,
-    ProfidriveControl,
-    ProfidriveStatus,
-)
-from multidrop.families.profiles.run_bits import (
-    DanfossControl,
-    DanfossFC,
-    DanfossStatus,
-    Optidrive,
-    OptidriveControl,
-    OptidriveStatus,
-    Yaskawa,
-    YaskawaControl,
-    YaskawaStatus,
 )
 from multidrop.sim.drive import Reason, Refusal
 from multidrop.sim.memory import MemoryCell

@@ -6,10 +6,9 @@ A family is a class that derives from a profile and declares its registers, or a
 
 from collections.abc import Mapping
 
+from multidrop.families.profiles.command_bits import CiA402, DanfossFC, Optidrive, Profidrive, Yaskawa
 from multidrop.families.profiles.command_codes import Delta, Inovance, Invt
-from multidrop.families.profiles.iec_61800_7 import CiA402, Profidrive
 from multidrop.families.profiles.profile import Profile, Role
-from multidrop.families.profiles.run_bits import DanfossFC, Optidrive, Yaskawa
 
 __all__ = [
     "PROFILES",
