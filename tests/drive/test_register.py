@@ -508,3 +508,14 @@ def test_the_first_language_with_register_titles_is_chosen(tags: list[str], lang
 def test_a_unit_and_an_enumeration_may_be_keywords() -> None:
     assert reading(0x10, unit="kW").unit == "kW"
     assert reading(0x10, values=IntEnum("Mode", "SLOW")).values is not None
+
+
+def test_text_with_one_character_per_register_is_in_the_low_bytes() -> None:
+    version = text(250, 5, order="B")
+    assert version.decode(bytes.fromhex("0034 002E 0031 0000 0041")) == "4.1"
+    assert version.decode(bytes.fromhex("FF34 FF2E FF31 FF38 FF20")) == "4.18"
+    assert version.encode("4.1") == bytes.fromhex("0034 002E 0031 0000 0000")
+    with pytest.raises(ValueError, match="holds 5 characters, not 6"):
+        version.encode("4.18.1")
+    with pytest.raises(ValueError, match="a text has order = 'A'; it must be 'AB', 'BA' or 'B'"):
+        Text(1, 1, order="A")
