@@ -205,7 +205,7 @@ def test_a_missing_package_is_reported(run: Run, monkeypatch: pytest.MonkeyPatch
 
 
 def test_a_second_gateway_of_the_same_name_is_refused(run: Run, tmp_path: Path, nobody: str) -> None:
-    from multidrop.fleet.leases.lease import LifeLock
+    from multidrop.fleet.lines.lease import LifeLock
 
     with closing(LifeLock(tmp_path / "gw-1.lock")):
         said = one_sentence(run("fleet", "serve", "gw-1", "--folder", tmp_path, "--nats", nobody))

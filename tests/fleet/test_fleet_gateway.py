@@ -32,7 +32,7 @@ from multidrop.fleet.commands.fleet_commands import FleetCommands
 from multidrop.fleet.errors import FleetError
 from multidrop.fleet.followed import FollowedFleet
 from multidrop.fleet.gateway import FleetGateway
-from multidrop.fleet.leases.lease import LifeLock
+from multidrop.fleet.lines.lease import LifeLock
 from multidrop.fleet.metrics import MOST_CLIENTS, MOST_HEAD, answer, families_of, listen, serving
 from multidrop.fleet.overview import FleetView, FleetWatch
 from multidrop.fleet.page_part import FleetPart

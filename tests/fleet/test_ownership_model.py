@@ -10,9 +10,9 @@ from typing import NamedTuple
 import pytest
 from tables import table
 
-from multidrop.fleet.leases import rules as lease_rules
-from multidrop.fleet.leases.rules import SeenRevision, Terms
+from multidrop.fleet.lines import rules as lease_rules
 from multidrop.fleet.lines.ownership import NEEDED, NOBODY, LineRecords, Owner, claim_of, owner_value
+from multidrop.fleet.lines.rules import SeenRevision, Terms
 from multidrop.fleet.servers.buckets import NONE_YET, Record
 
 BUCKETS = 3

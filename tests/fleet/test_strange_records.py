@@ -17,10 +17,10 @@ from tables import table
 
 from multidrop.fleet.errors import FleetError, OutcomeUnknown
 from multidrop.fleet.gateway import FleetGateway, ask_gateway
-from multidrop.fleet.leases import member as member_module
-from multidrop.fleet.leases.lease import boottime_ns
-from multidrop.fleet.leases.member import Member
-from multidrop.fleet.leases.rules import SECOND, USUAL
+from multidrop.fleet.lines import member as member_module
+from multidrop.fleet.lines.lease import boottime_ns
+from multidrop.fleet.lines.member import Member
+from multidrop.fleet.lines.rules import SECOND, USUAL
 from multidrop.fleet.samples import samples_stream
 from multidrop.fleet.servers import names, setup
 from multidrop.fleet.servers.buckets import LARGE, SMALL, Bucket, LeaseBucket, Record, ServerError, parsed

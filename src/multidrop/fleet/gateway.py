@@ -21,11 +21,11 @@ from multidrop.fleet.commands.desk import CommandSubjects
 from multidrop.fleet.commands.held_lines import HeldLines
 from multidrop.fleet.commands.log import CommandLog
 from multidrop.fleet.errors import FleetError, NoRight
-from multidrop.fleet.leases.lease import LifeLock
-from multidrop.fleet.leases.member import Member
-from multidrop.fleet.leases.rules import SECOND, USUAL
+from multidrop.fleet.lines.lease import LifeLock
 from multidrop.fleet.lines.line_keeper import LINES_AT_ONCE, SILENT_S, PortLoss
+from multidrop.fleet.lines.member import Member
 from multidrop.fleet.lines.records import MOST_REPORTED
+from multidrop.fleet.lines.rules import SECOND, USUAL
 from multidrop.fleet.samples.forwarder import Forwarder
 from multidrop.fleet.samples.samples_stream import samples_path
 from multidrop.fleet.servers import names

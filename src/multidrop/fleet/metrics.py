@@ -17,7 +17,7 @@ from ipaddress import ip_address
 from typing import Any
 
 from multidrop.exposition import MetricFamily, expose_metrics
-from multidrop.fleet.leases.member import MemberState
+from multidrop.fleet.lines.member import MemberState
 from multidrop.toml_check import parse_address
 
 _SUFFIXES = {"gauge": "", "counter": "_total"}

@@ -11,7 +11,7 @@ from typing import Any
 
 from multidrop.fleet.errors import FleetError
 from multidrop.fleet.gateway import ask_gateway
-from multidrop.fleet.leases.observer import BELIEVING
+from multidrop.fleet.lines.observer import BELIEVING
 from multidrop.fleet.lines.ownership import owner_of
 from multidrop.fleet.lines.records import FleetRecords, move_of
 from multidrop.fleet.servers.buckets import Record

@@ -11,12 +11,12 @@ from typing import Any
 import pytest
 from fleets import GatedBucket, Hall, HandClock, MemoryBucket, RecordingLines, RecordingMastership
 
-from multidrop.fleet.leases.lease import Lease
-from multidrop.fleet.leases.rules import SECOND, USUAL
 from multidrop.fleet.lines import line_keeper
+from multidrop.fleet.lines.lease import Lease
 from multidrop.fleet.lines.line_keeper import LineKeeper, PortLoss
 from multidrop.fleet.lines.ownership import owner_of, owner_value
 from multidrop.fleet.lines.records import ShareRecords
+from multidrop.fleet.lines.rules import SECOND, USUAL
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import Record
 

@@ -20,7 +20,7 @@ from multidrop.control.outcome import Effect, Seen
 from multidrop.core.exchange import Status
 from multidrop.drive.register import Access
 from multidrop.drive.verbs import LISTED_VERBS
-from multidrop.fleet.leases.member import MemberState
+from multidrop.fleet.lines.member import MemberState
 from multidrop.gateway.http.files import PAGE, read_files
 from multidrop.gateway.http.rights import Right
 from multidrop.gateway.live import alarms, hub

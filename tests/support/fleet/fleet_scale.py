@@ -14,8 +14,8 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from multidrop.fleet.leases.lease import boottime_ns
-from multidrop.fleet.leases.member import Member
+from multidrop.fleet.lines.lease import boottime_ns
+from multidrop.fleet.lines.member import Member
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import Bucket
 from multidrop.fleet.servers.connections import paths_of

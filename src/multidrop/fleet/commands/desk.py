@@ -47,7 +47,7 @@ from multidrop.fleet.commands.messages import (
     worst,
 )
 from multidrop.fleet.commands.offers import Offer, Offers, Prepared, prepare
-from multidrop.fleet.leases.lease import boottime_ns
+from multidrop.fleet.lines.lease import boottime_ns
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.connections import ServerPath
 from multidrop.plant import drive_meant

@@ -19,7 +19,7 @@ from multidrop.control.commands import carry_out_verb, stop_drive_by, typed_valu
 from multidrop.drive import verb_arguments, verbs_of
 from multidrop.fleet.commands.held_lines import HeldLine
 from multidrop.fleet.commands.messages import CommandAnswer, CommandRequest
-from multidrop.fleet.leases.rules import SECOND
+from multidrop.fleet.lines.rules import SECOND
 
 LIMIT_NS = 1 * SECOND  # time limit from the offer until the command's first frame is sent
 REMEMBERED = 10_000  # limit of remembered offers; the oldest are forgotten

@@ -1,1 +1,1 @@
-"""Lines: which gateway polls which line, and how a line changes its master."""
+"""Leases and lines: a gateway with a lease may poll lines; ownership records say which lines it polls."""

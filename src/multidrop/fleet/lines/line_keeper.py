@@ -17,8 +17,7 @@ from itertools import islice
 from typing import Any, NamedTuple, Protocol
 
 from multidrop.fleet.errors import FleetError
-from multidrop.fleet.leases.lease import Lease
-from multidrop.fleet.leases.rules import SECOND
+from multidrop.fleet.lines.lease import Lease
 from multidrop.fleet.lines.ownership import (
     NEEDED,
     NOBODY,
@@ -30,6 +29,7 @@ from multidrop.fleet.lines.ownership import (
     turn_of,
 )
 from multidrop.fleet.lines.records import ShareRecords
+from multidrop.fleet.lines.rules import SECOND
 from multidrop.fleet.lines.shares import UnopenedLines
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import Record, WriteAnswers

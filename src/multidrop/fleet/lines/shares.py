@@ -23,7 +23,7 @@ from typing import NamedTuple
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from multidrop.fleet.leases.rules import SECOND
+from multidrop.fleet.lines.rules import SECOND
 
 BOUND = 110  # limit of a gateway's lines, in percent of the mean
 NUMBER_BITS = 16  # the low bits of a weight hold its gateway's number

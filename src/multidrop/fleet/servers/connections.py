@@ -31,7 +31,7 @@ from multidrop.fleet.errors import (
     TooOld,
     failure_to_connect,
 )
-from multidrop.fleet.leases.rules import PATHS
+from multidrop.fleet.lines.rules import PATHS
 from multidrop.fleet.servers.batch_client import BatchClient, DirectGet, DirectMessage, Request
 from multidrop.printable import masked
 from multidrop.supervisor import end_tasks

@@ -17,14 +17,14 @@ from fleets import Hall, HandClock, MemoryBucket, RecordingMastership
 from nats_clusters import Cluster, close_all, opened_paths
 
 from multidrop.fleet.errors import Conflict
-from multidrop.fleet.leases import member as member_module
-from multidrop.fleet.leases import rules as lease_rules
-from multidrop.fleet.leases.lease import HeldRecord, Lease, boottime_ns
-from multidrop.fleet.leases.member import IncompatibleGateways, Member, MemberState
-from multidrop.fleet.leases.observer import Observer
-from multidrop.fleet.leases.rules import RULES, SECOND, USUAL, Terms
 from multidrop.fleet.lines import line_keeper, releases, shares
+from multidrop.fleet.lines import member as member_module
+from multidrop.fleet.lines import rules as lease_rules
+from multidrop.fleet.lines.lease import HeldRecord, Lease, boottime_ns
 from multidrop.fleet.lines.line_keeper import PortLoss
+from multidrop.fleet.lines.member import IncompatibleGateways, Member, MemberState
+from multidrop.fleet.lines.observer import Observer
+from multidrop.fleet.lines.rules import RULES, SECOND, USUAL, Terms
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import Bucket, LeaseBucket
 from multidrop.fleet.servers.connections import paths_of

@@ -13,10 +13,10 @@ from fleets import GatedBucket, HandClock, MemoryBucket, RecordingMastership
 from tables import table
 
 from multidrop.fleet.errors import FleetError, OutcomeUnknown
-from multidrop.fleet.leases import lease as leases
-from multidrop.fleet.leases.lease import Lease, LifeLock
-from multidrop.fleet.leases.observer import Observer
-from multidrop.fleet.leases.rules import SECOND, USUAL
+from multidrop.fleet.lines import lease as leases
+from multidrop.fleet.lines.lease import Lease, LifeLock
+from multidrop.fleet.lines.observer import Observer
+from multidrop.fleet.lines.rules import SECOND, USUAL
 
 
 class Trial:

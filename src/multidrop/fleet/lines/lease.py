@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 
 from multidrop.core import Mastership
 from multidrop.fleet.errors import Conflict, FleetError, OutcomeUnknown
-from multidrop.fleet.leases import rules as lease_rules
-from multidrop.fleet.leases.rules import RENEW_S, SECOND, SeenRevision, Terms
+from multidrop.fleet.lines import rules as lease_rules
+from multidrop.fleet.lines.rules import RENEW_S, SECOND, SeenRevision, Terms
 from multidrop.fleet.servers.buckets import NONE_YET, Bucket, Record
 from multidrop.recording import FileLock
 

@@ -1,1 +1,0 @@
-"""Leases: a lease allows a gateway to poll lines for a limited time."""
