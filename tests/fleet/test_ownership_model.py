@@ -11,8 +11,17 @@ import pytest
 from tables import table
 
 from multidrop.fleet.lines import rules as lease_rules
-from multidrop.fleet.lines.ownership import NEEDED, NOBODY, LineRecords, Owner, claim_of, owner_value
-from multidrop.fleet.lines.rules import SeenRevision, Terms
+from multidrop.fleet.lines.rules import (
+    NEEDED,
+    NOBODY,
+    LineRecords,
+    Owner,
+    SeenRevision,
+    Terms,
+    claim_of,
+    owner_value,
+)
+from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import NONE_YET, Record
 
 BUCKETS = 3
@@ -482,5 +491,5 @@ def test_the_model_finds_two_masters_if_a_lease_rule_is_changed(mutation: str) -
 def test_the_default_lease_terms_allow_only_one_master() -> None:
     """Two quorums always share a lease record, and the kernel kills the holder before the guard time ends."""
     terms = Terms()
-    assert terms.needed + terms.ended > lease_rules.PATHS
+    assert terms.needed + terms.ended > len(names.LEASES)
     assert killed_at(0, terms) < terms.guard

@@ -12,8 +12,8 @@ from nats_clusters import Cluster as Servers
 from tables import table
 
 from multidrop.fleet.lines import releases
-from multidrop.fleet.lines.ownership import NEEDED, Claim, Step, claim_of, decide, owner_by, owner_value
 from multidrop.fleet.lines.releases import SILENT_SERVER_S, Releases
+from multidrop.fleet.lines.rules import NEEDED, Claim, Step, claim_of, decide, owner_by, owner_value
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import Record
 from multidrop.fleet.servers.leaders import Cluster, Replica

@@ -6,7 +6,7 @@ import asyncio
 import time
 from collections.abc import Callable, Set
 
-from multidrop.fleet.lines.ownership import NEEDED
+from multidrop.fleet.lines.rules import NEEDED
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.connections import ServerPath
 from multidrop.fleet.servers.leaders import known_cluster

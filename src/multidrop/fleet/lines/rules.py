@@ -1,4 +1,6 @@
-"""Lease rules: until when a gateway may send, and when another may end its session. No I/O.
+"""Rules of leases and of ownership. No I/O.
+
+Leases: until when may a gateway send, and when may another gateway end its session?
 
 A session has one record in each of three lease buckets. Its holder must renew two of them (`needed`). A
 gateway that takes over must end two of them (`ended`). So both must write in at least one common bucket,
@@ -11,17 +13,31 @@ revision. So clocks of different computers are never compared. An ended record s
 Once a session is over, its lines are claimed and opened immediately. The guard time starts then: before its
 first request on a line, the engine only listens for at least this time (csrc/line.c).
 tests/fleet/test_ownership_model.py checks all interleavings with these functions.
+
+Ownership: which records name a line's master, and when may a gateway write them?
+
+A line has one record in each of three buckets, with one vote each. Its master is the session that at least
+two votes name, so no line waits for a bucket without a leader. A record that names a living session is
+replaced only by that session, and only at the revision that its gateway has read. So two sessions never have
+two votes each.
+
+The very first record of a line has two votes, which shortens the cold start of a large fleet by a second. It
+is written in the line's first bucket, where the server accepts only one first record. A gateway that has not
+read this record writes nothing in the other buckets.
+
+Records are written only when a line changes its master. A record becomes void when its session is over.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import NamedTuple
+from collections.abc import Callable, Collection, Iterable, Mapping
+from typing import Any, NamedTuple
+
+from multidrop.fleet.servers.buckets import NONE_YET, Record
 
 SECOND = 1_000_000_000  # one second in ns
-PATHS = 3
 RENEW_S = 0.5  # time between renewals of a lease record
-RULES = 2  # version of the rules in ownership.py; increment it if those rules change
+RULES = 2  # version of the rules of ownership below; increment it if those rules change
 
 
 class Terms(NamedTuple):
@@ -73,3 +89,137 @@ def is_stale(watched: SeenRevision, now: int, terms: Terms) -> bool:
 def is_over(ended: int, terms: Terms) -> bool:
     """Return True if a session is over after this many of its lease records were ended."""
     return ended >= terms.ended
+
+
+# ---- ownership ----
+
+NOBODY = ""
+NEEDED = 2  # number of votes that make a session the master of a line
+
+Owner = tuple[str, int]  # a gateway and its session
+# a line's ownership records by bucket, in the order of writing; None: not read yet
+LineRecords = Mapping[str, Record | None]
+
+
+class Claim(NamedTuple):
+    """The ownership records that a gateway must write to become the master of a line.
+
+    `first` and `spare` contain the buckets, each with the revision of the record to replace. The `spare`
+    records are written only if the write of a `first` record gets no answer. Each record that is written
+    gives the gateway `votes` votes.
+    """
+
+    first: dict[str, int]
+    spare: dict[str, int]
+    turn: int
+    votes: int = 1
+
+
+class Step(NamedTuple):
+    """The lines that a gateway should claim now, and the lines that it should release now."""
+
+    claims: dict[str, Claim]  # the records to write, by line
+    releases: set[str]
+
+
+def owner_of(record: Record | None) -> Owner:
+    """Return the gateway and session that an ownership record names; NOBODY and 0 for a free line."""
+    if record is None or not record.value:
+        return NOBODY, 0
+    return record.value["gateway"], record.value["session"]
+
+
+def owner_value(owner: Owner, turn: int, now_ms: int, votes: int = 1) -> dict[str, Any]:
+    """Return the content of a line's record that names this owner.
+
+    `turn` is the number of claims and releases of the line so far. `turn` and `now_ms` (UTC) are only for
+    display.
+    """
+    return {"gateway": owner[0], "session": owner[1], "votes": votes, "turn": turn, "since": now_ms}
+
+
+def votes_of(owner: Owner, records: Iterable[Record | None]) -> int:
+    return sum(record.value["votes"] for record in records if record and owner_of(record) == owner)
+
+
+def owner_by(records: LineRecords) -> Record | None:
+    """Return the newest ownership record of the owner with enough votes; None without such an owner.
+
+    The owner of a free line is NOBODY.
+    """
+    known = [record for record in records.values() if record and record.value]
+    decided = [record for record in known if votes_of(owner_of(record), known) >= NEEDED]
+    return max(decided, key=lambda record: record.value["turn"], default=None)
+
+
+def turn_of(records: LineRecords) -> int:
+    """Return the number of claims and releases of the line so far; 0 if it never had a master."""
+    turn = 0
+    for record in records.values():
+        if record and record.value and record.value["turn"] > turn:
+            turn = record.value["turn"]
+    return turn
+
+
+def claim_of(
+    me: Owner,
+    records: LineRecords,
+    is_over: Callable[[str, int], bool],
+    doubted: Collection[str] = (),
+    leaderless: Collection[str] = (),
+) -> Claim | None:
+    """Return the records that this session must write to become the line's master.
+
+    Return None if it is the master already, or cannot become the master now. `doubted` are the buckets in
+    which this gateway has released the line without getting an answer. `leaderless` are buckets that may have
+    no leader, so the records in them are written last.
+    """
+    first_bucket, first = next(iter(records.items()), ("", None))
+    if not first:
+        return None  # this record was not read yet; it may give another session two votes
+    if first.revision == NONE_YET:
+        return Claim({first_bucket: NONE_YET}, {}, 1, NEEDED)
+    free: dict[str, int] = {}
+    needed = NEEDED
+    for bucket, record in records.items():
+        owner = owner_of(record)
+        if owner == me and record and bucket not in doubted:
+            needed -= record.value["votes"]
+        elif record and (owner == me or owner[0] == NOBODY or is_over(*owner)):
+            free[bucket] = record.revision
+        elif record and record.value["votes"] >= NEEDED:
+            return None  # another living session already has both votes
+    if not 0 < needed <= len(free):
+        return None
+    wanted = {bucket: free[bucket] for bucket in sorted(free, key=leaderless.__contains__)[:needed]}
+    spare = {bucket: revision for bucket, revision in free.items() if bucket not in wanted}
+    return Claim(wanted, spare, turn_of(records) + 1)
+
+
+def decide(
+    me: Owner,
+    lines: Iterable[str],
+    wanted: Mapping[str, str],
+    records_of: Callable[[str], LineRecords],
+    claim_of_line: Callable[[str], Claim | None],
+    *,
+    is_settled: bool,
+    is_draining: bool,
+) -> Step:
+    """Return which lines to claim and which to release.
+
+    `me` is this gateway's name and session, `wanted` the gateway that each line is assigned to. A line that
+    never had a master is claimed only if `is_settled`, which is False in the first seconds of a session.
+    Otherwise the first gateway of a starting fleet would take all of these lines.
+    """
+    step = Step({}, set())
+    for line in lines:
+        records = records_of(line)
+        ours = votes_of(me, records.values())
+        if ours and (is_draining or wanted.get(line, me[0]) != me[0]):
+            step.releases.add(line)
+        elif ours >= NEEDED or wanted.get(line) != me[0] or is_draining:
+            continue
+        elif (is_settled or turn_of(records)) and (claim := claim_of_line(line)):
+            step.claims[line] = claim
+    return step

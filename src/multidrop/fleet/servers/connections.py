@@ -31,11 +31,12 @@ from multidrop.fleet.errors import (
     TooOld,
     failure_to_connect,
 )
-from multidrop.fleet.lines.rules import PATHS
+from multidrop.fleet.servers import names
 from multidrop.fleet.servers.batch_client import BatchClient, DirectGet, DirectMessage, Request
 from multidrop.printable import masked
 from multidrop.supervisor import end_tasks
 
+PATHS = len(names.LEASES)  # number of connections of a process
 # Minimum version of NATS. In 2.9.10, several clients may replace the same revision (nats-server issue 4320).
 OLDEST = (2, 12)
 CONNECT_S = 1.0
