@@ -17,7 +17,7 @@ from fleets import Hall, HandClock, MemoryBucket, RecordingMastership
 from nats_clusters import Cluster, close_all, opened_paths
 
 from multidrop.fleet.errors import Conflict
-from multidrop.fleet.lines import line_keeper, releases, shares
+from multidrop.fleet.lines import line_keeper, shares
 from multidrop.fleet.lines import member as member_module
 from multidrop.fleet.lines import rules as lease_rules
 from multidrop.fleet.lines.lease import HeldRecord, Lease, boottime_ns
@@ -25,7 +25,7 @@ from multidrop.fleet.lines.line_keeper import PortLoss
 from multidrop.fleet.lines.member import IncompatibleGateways, Member, MemberState
 from multidrop.fleet.lines.observer import Observer
 from multidrop.fleet.lines.rules import RULES, SECOND, USUAL, Terms
-from multidrop.fleet.servers import names
+from multidrop.fleet.servers import leaders, names
 from multidrop.fleet.servers.buckets import Bucket, LeaseBucket
 from multidrop.fleet.servers.connections import paths_of
 from multidrop.fleet.servers.leaders import Cluster as Servers
@@ -244,7 +244,7 @@ async def test_only_a_drained_gateway_releases_lines_while_a_server_is_silent(
     monkeypatch.setattr(member_module, "SILENT_SERVER_S", math.inf)
     async with gateways(fleet, "a", "b", terms=LONG) as running:
         await until(running.are_shared, "start")
-        monkeypatch.setattr(releases, "known_cluster", maimed)
+        monkeypatch.setattr(leaders, "known_cluster", maimed)
         joined, drained = await running.join("c"), running.members["b"]
         await until(lambda: "c" in drained.wanted.values(), "its share")
         await asyncio.sleep(1.0)

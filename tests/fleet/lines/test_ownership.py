@@ -11,12 +11,10 @@ from fleet_scale import groups, large_fleet, plant_of_fake_lines, until
 from nats_clusters import Cluster as Servers
 from tables import table
 
-from multidrop.fleet.lines import releases
-from multidrop.fleet.lines.releases import SILENT_SERVER_S, Releases
 from multidrop.fleet.lines.rules import NEEDED, Claim, Step, claim_of, decide, owner_by, owner_value
-from multidrop.fleet.servers import names
+from multidrop.fleet.servers import leaders, names
 from multidrop.fleet.servers.buckets import Record
-from multidrop.fleet.servers.leaders import Cluster, Replica
+from multidrop.fleet.servers.leaders import SILENT_SERVER_S, Cluster, Releases, Replica
 
 ME = ("a", 7)
 BEFORE = ("a", 6)
@@ -205,7 +203,7 @@ class Releasing:
         self.now_s = 0.0
         nowhere: Any = None
         self.releases = Releases(lambda: nowhere, self.note, lambda: self.now_s)
-        monkeypatch.setattr(releases, "known_cluster", self.known_cluster)
+        monkeypatch.setattr(leaders, "known_cluster", self.known_cluster)
 
     def note(self) -> None:
         self.changes += 1

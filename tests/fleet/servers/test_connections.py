@@ -15,7 +15,7 @@ from multidrop.fleet.servers.batch_client import DirectGet, DirectMessage, Reque
 from multidrop.fleet.servers.connections import AGAIN_S, EARNED, MOST_REPEATS, RepeatBudget, first_answer
 from multidrop.fleet.servers.leaders import (
     HAND_OVER_S,
-    SILENT_FOR_S,
+    SILENT_SERVER_S,
     SOON_S,
     LeaseTerms,
     bring_leaders_home,
@@ -323,7 +323,7 @@ async def test_leadership_moves_again_after_an_election_while_a_server_is_silent
 async def test_a_server_that_stays_silent_is_ignored_until_it_returns(servers: Servers) -> None:
     servers.silent = {"n3"}
     servers.leaders[names.LEASES[2]] = "n1"
-    await servers.pass_s(round(SILENT_FOR_S) + 5)
+    await servers.pass_s(round(SILENT_SERVER_S) + 5)
     before = dict(servers.terms)
     await servers.pass_s(20)
     assert servers.terms == before

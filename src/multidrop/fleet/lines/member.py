@@ -30,13 +30,12 @@ from multidrop.fleet.lines.lease import Lease, LifeLock
 from multidrop.fleet.lines.line_keeper import LineKeeper, Lines, TakenLine
 from multidrop.fleet.lines.observer import Observer
 from multidrop.fleet.lines.records import ShareRecords
-from multidrop.fleet.lines.releases import SILENT_SERVER_S, Releases
 from multidrop.fleet.lines.rules import RULES, SECOND, USUAL, Terms, decide, owner_of
 from multidrop.fleet.lines.shares import Sharers, Shares
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import LeaseBucket, Record
 from multidrop.fleet.servers.connections import ServerPath
-from multidrop.fleet.servers.leaders import have_leaders, keep_leaders
+from multidrop.fleet.servers.leaders import SILENT_SERVER_S, Releases, have_leaders, keep_leaders
 from multidrop.supervisor import Ended, end_tasks, supervisor
 
 _log = logging.getLogger("multidrop.fleet")
