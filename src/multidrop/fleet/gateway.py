@@ -18,8 +18,8 @@ from nats.aio.msg import Msg
 from multidrop import Plant, Poller, PollingFailed
 from multidrop.core import Mastership
 from multidrop.fleet.commands.desk import CommandSubjects
-from multidrop.fleet.commands.held_lines import HeldLines
 from multidrop.fleet.commands.log import CommandLog
+from multidrop.fleet.commands.offers import HeldLines
 from multidrop.fleet.errors import FleetError, NoRight
 from multidrop.fleet.lines.lease import LifeLock
 from multidrop.fleet.lines.line_keeper import LINES_AT_ONCE, SILENT_S, PortLoss

@@ -16,9 +16,9 @@ from motors import quick
 from multidrop import Bus
 from multidrop.control import CommandOutcome, commands, read_audit, written_before
 from multidrop.fleet.commands.desk import CommandDesk, StopDesk
-from multidrop.fleet.commands.held_lines import HeldLines
 from multidrop.fleet.commands.log import CommandLog
 from multidrop.fleet.commands.messages import CommandAnswer, Offered
+from multidrop.fleet.commands.offers import HeldLines
 from multidrop.fleet.errors import Conflict, OutcomeUnknown
 from multidrop.fleet.lines.line_keeper import PortLoss
 from multidrop.fleet.lines.rules import SECOND

@@ -32,7 +32,6 @@ from nats.aio.msg import Msg
 from multidrop import Unsupported
 from multidrop.control import CommandOutcome, CommandResult, written_by
 from multidrop.control.commands import JoinedStops, LineStop, RepeatedStops, begin_command, stop_line
-from multidrop.fleet.commands.held_lines import HeldLine, HeldLines
 from multidrop.fleet.commands.log import CommandLog
 from multidrop.fleet.commands.messages import (
     CommandAnswer,
@@ -46,7 +45,7 @@ from multidrop.fleet.commands.messages import (
     spelt,
     worst,
 )
-from multidrop.fleet.commands.offers import Offer, Offers, Prepared, prepare
+from multidrop.fleet.commands.offers import HeldLine, HeldLines, Offer, Offers, Prepared, prepare
 from multidrop.fleet.lines.lease import boottime_ns
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.connections import ServerPath
