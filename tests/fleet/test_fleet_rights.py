@@ -19,7 +19,7 @@ from nats.aio.client import Client
 from secured_clusters import SecuredCluster, secured_cluster
 
 from multidrop.fleet.errors import Denials, MayNotSend, NoRight
-from multidrop.fleet.servers.credentials import connect_options, inbox_of, public_key
+from multidrop.fleet.servers.connections import connect_options, inbox_of, public_key
 from multidrop.fleet.servers.rights import OTHERS, rights_of
 
 GATEWAYS = ("gw-a", "gw-b")

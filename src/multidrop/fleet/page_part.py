@@ -168,8 +168,7 @@ def build(settings: FleetSettings, inside: HasFolder) -> FleetPart:
     """
     from multidrop.fleet.commands.fleet_commands import FleetCommands
     from multidrop.fleet.overview import FleetView, FleetWatch
-    from multidrop.fleet.servers.connections import ServerPath
-    from multidrop.fleet.servers.credentials import connect_options
+    from multidrop.fleet.servers.connections import ServerPath, connect_options
 
     def options(credentials: str) -> dict[str, Any]:
         files = (inside.folder / name if name else None for name in (credentials, settings.ca))

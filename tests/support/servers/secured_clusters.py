@@ -21,7 +21,7 @@ from nats_clusters import Cluster, Node, server_program, started_cluster
 from peers import require_program
 from serial_hall import SerialHall
 
-from multidrop.fleet.servers.credentials import connect_options
+from multidrop.fleet.servers.connections import connect_options
 from multidrop.fleet.servers.files import ROUTE_PORTS, TlsFiles, write_files
 from multidrop.fleet.servers.rights import STORE
 

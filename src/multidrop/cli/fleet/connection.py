@@ -49,7 +49,7 @@ def nats_urls(given: str | None) -> list[str]:
 
 def nats_options(arguments: argparse.Namespace, urls: Sequence[str]) -> dict[str, Any]:
     """Return nats-py's options for a connection. Raises ValueError if the credentials file has no key."""
-    from multidrop.fleet.servers.credentials import connect_options
+    from multidrop.fleet.servers.connections import connect_options
 
     logging.getLogger("asyncio").addFilter(_is_news)
     credentials = arguments.credentials or _named(CREDENTIALS)

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import urlsplit
 
-from multidrop.fleet.servers.credentials import new_seed, public_key
+from multidrop.fleet.servers.connections import new_seed, public_key
 from multidrop.fleet.servers.rights import accounts, rights_of
 from multidrop.printable import masked
 from multidrop.whole_file import whole_file

@@ -34,7 +34,7 @@ from typing import NamedTuple
 
 from multidrop.fleet.samples.samples_stream import STREAM
 from multidrop.fleet.servers import names
-from multidrop.fleet.servers.credentials import inbox_of
+from multidrop.fleet.servers.connections import inbox_of
 from multidrop.fleet.servers.setup import CONTEST
 
 API = "$JS.API"
