@@ -20,7 +20,7 @@ from secured_clusters import SecuredCluster, secured_cluster
 
 from multidrop.fleet.errors import Denials, MayNotSend, NoRight
 from multidrop.fleet.servers.connections import connect_options, inbox_of, public_key
-from multidrop.fleet.servers.rights import OTHERS, rights_of
+from multidrop.fleet.servers.files import OTHERS, rights_of
 
 GATEWAYS = ("gw-a", "gw-b")
 USERS = (*GATEWAYS, *OTHERS)
