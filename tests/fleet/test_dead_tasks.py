@@ -31,7 +31,7 @@ from multidrop.fleet.commands.fleet_commands import FleetCommands
 from multidrop.fleet.commands.log import CommandLog
 from multidrop.fleet.gateway import CommandedLines, FleetGateway, FleetLines
 from multidrop.fleet.samples import forwarder as forwarder_module
-from multidrop.fleet.samples import parquet_sink
+from multidrop.fleet.samples import hub
 from multidrop.fleet.samples.forwarder import Forwarder
 from multidrop.fleet.servers import names
 from multidrop.samples import spool as spool_module
@@ -247,8 +247,8 @@ async def test_the_hub_retries_if_the_compaction_process_cannot_start(
         tried.append(words)
         raise BlockingIOError("no process is left")
 
-    monkeypatch.setattr(parquet_sink, "_compact", fail_to_begin)
-    merging = asyncio.create_task(parquet_sink.compact_for_ever(tmp_path, every=0.0))
+    monkeypatch.setattr(hub, "_compact", fail_to_begin)
+    merging = asyncio.create_task(hub.compact_for_ever(tmp_path, every=0.0))
     while len(tried) < 3:
         await asyncio.sleep(0)
     merging.cancel()

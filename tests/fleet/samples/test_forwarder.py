@@ -25,8 +25,7 @@ from multidrop.fleet.errors import FleetError, NoRight, OutcomeUnknown
 from multidrop.fleet.samples import forwarder as forwarder_module
 from multidrop.fleet.samples import samples_stream
 from multidrop.fleet.samples.forwarder import Forwarder
-from multidrop.fleet.samples.hub import HubState, SampleHub, SourceCheck
-from multidrop.fleet.samples.parquet_sink import ParquetSink
+from multidrop.fleet.samples.hub import HubState, ParquetSink, SampleHub, SourceCheck
 from multidrop.fleet.samples.samples_stream import (
     StreamMessage,
     create_stream,
