@@ -30,9 +30,8 @@ from multidrop.fleet.commands.desk import CommandSubjects
 from multidrop.fleet.commands.fleet_commands import FleetCommands
 from multidrop.fleet.commands.log import CommandLog
 from multidrop.fleet.gateway import CommandedLines, FleetGateway, FleetLines
-from multidrop.fleet.samples import forwarder as forwarder_module
-from multidrop.fleet.samples import hub
-from multidrop.fleet.samples.forwarder import Forwarder
+from multidrop.fleet.samples import hub, samples_stream
+from multidrop.fleet.samples.samples_stream import Forwarder
 from multidrop.fleet.servers import names
 from multidrop.samples import spool as spool_module
 from multidrop.samples.polled_units import PolledUnits
@@ -45,8 +44,8 @@ STARTERS = {
     *("create_task", "ensure_future", "to_thread", "run_in_executor"),
 }
 WAITED_FOR = {  # modules that start tasks or threads, and wait for them
-    *("connections", "fleet_commands", "followed", "forwarder", "gateway", "hub", "leaders"),
-    *("line_keeper", "member", "observer", "page_part", "shares"),
+    *("connections", "fleet_commands", "followed", "gateway", "hub", "leaders"),
+    *("line_keeper", "member", "observer", "page_part", "samples_stream", "shares"),
     "spool",  # this module's thread is checked by the gateway
 }
 MEMBER = (
@@ -194,7 +193,7 @@ async def test_a_command_client_reports_the_end_of_its_connection(fleet: Cluster
 async def test_an_unexpected_failure_of_the_forwarder_is_logged_and_it_retries(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(forwarder_module, "AGAIN_S", 0.0)
+    monkeypatch.setattr(samples_stream, "AGAIN_S", 0.0)
     spool = Spool(tmp_path / "spool", "gw-1")
     nowhere: Any = None
     forwarder = Forwarder(spool, nowhere)

@@ -23,9 +23,14 @@ from terminals import closing_terminal
 from multidrop import History
 from multidrop.cli import main
 from multidrop.fleet.samples import hub
-from multidrop.fleet.samples.forwarder import Forwarder
 from multidrop.fleet.samples.hub import Commit, ParquetSink, SampleHub, StoredPosition, compact_for_ever
-from multidrop.fleet.samples.samples_stream import create_stream, publish, samples_path, stream_info
+from multidrop.fleet.samples.samples_stream import (
+    Forwarder,
+    create_stream,
+    publish,
+    samples_path,
+    stream_info,
+)
 from multidrop.fleet.servers.connections import ServerPath
 from multidrop.history import compact as compact_module
 from multidrop.history.compact import main as compact
