@@ -30,7 +30,7 @@ from multidrop.drive.known_state import can_show_fault
 from multidrop.polling.batch import Rows
 from multidrop.recording import FORMATS
 from multidrop.runs import RunResult, TestRun
-from multidrop.runs.bus_time import silence_of
+from multidrop.runs.checks import silence_of
 from multidrop.runs.loader import STOP
 from multidrop.runs.model import length, polled_drive
 

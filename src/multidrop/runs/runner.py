@@ -29,11 +29,9 @@ from multidrop.poller import Poller
 from multidrop.polling.batch import Rows, copied
 from multidrop.recording import RecordingWriter, open_writer
 from multidrop.recording.phases import phase_row, with_phases
-from multidrop.runs.bus_time import RAMP_EVERY_S, misfits, silence_of
+from multidrop.runs.checks import RAMP_EVERY_S, check_step, misfits, silence_of
 from multidrop.runs.loader import STOP, load_test
-from multidrop.runs.model import RunPlan, RunStep, timeline
-from multidrop.runs.rules import check_step
-from multidrop.runs.watch import LimitWatch
+from multidrop.runs.model import LimitWatch, RunPlan, RunStep, timeline
 from multidrop.transport import clock
 from multidrop.transport.port_identity import is_simulated
 
