@@ -34,7 +34,7 @@ from multidrop.fleet.samples import hub, samples_stream
 from multidrop.fleet.samples.samples_stream import Forwarder
 from multidrop.fleet.servers import names
 from multidrop.samples import spool as spool_module
-from multidrop.samples.polled_units import PolledUnits
+from multidrop.samples.message import PolledUnits
 from multidrop.samples.spool import Spool
 from multidrop.sim import Simulator, Wire, simulated
 from multidrop.supervisor import Ended, end_tasks, supervisor

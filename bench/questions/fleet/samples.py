@@ -30,8 +30,7 @@ from multidrop import PlantLine
 from multidrop.fleet.samples.hub import Commit, ParquetSink, SampleSink
 from multidrop.fleet.samples.postgres_sink import PostgresSink
 from multidrop.polling import BatchColumns
-from multidrop.samples.message import Packed, RowBuffer, unpack
-from multidrop.samples.polled_units import PolledUnits
+from multidrop.samples.message import Packed, PolledUnits, RowBuffer, unpack
 from multidrop.samples.spool import SpoolFolder
 
 UTC = 1_795_253_399_123_456_789

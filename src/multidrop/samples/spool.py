@@ -29,8 +29,7 @@ from typing import Any, NamedTuple
 
 from multidrop.polling.batch import Batch
 from multidrop.recording import FileLock
-from multidrop.samples.message import MessageError, Packed, RowBuffer, unpack
-from multidrop.samples.polled_units import PolledUnits
+from multidrop.samples.message import MessageError, Packed, PolledUnits, RowBuffer, unpack
 from multidrop.whole_file import sync_to_disk, whole_file
 
 FORMAT = "multidrop spool 1"

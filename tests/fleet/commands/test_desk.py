@@ -551,7 +551,7 @@ import asyncio, sys, threading
 from pathlib import Path
 from multidrop.core import Mastership
 from multidrop.fleet.gateway import FleetLines
-from multidrop.samples.polled_units import PolledUnits
+from multidrop.samples.message import PolledUnits
 
 async def main():
     lines = FleetLines(Mastership(), Path(sys.argv[1]).parent, PolledUnits())

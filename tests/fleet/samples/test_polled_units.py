@@ -27,8 +27,7 @@ from multidrop.fleet.samples.samples_stream import StreamMessage, read_after
 from multidrop.fleet.servers.buckets import Record
 from multidrop.fleet.servers.plant_store import line_of
 from multidrop.history import compact, quantities
-from multidrop.samples.message import RowBuffer, unpack
-from multidrop.samples.polled_units import RAW, PolledUnits
+from multidrop.samples.message import RAW, PolledUnits, RowBuffer, unpack
 
 FAMILY = """
 [family]
