@@ -8,7 +8,18 @@ from functools import cached_property
 from math import isfinite
 from typing import Any, NamedTuple
 
-from multidrop.channels.functions import AS, FUNCTIONS, MEMORIES, NAMES, TABLE, Curve, StatefulFunction, Value
+from multidrop.channels.functions import (
+    AS,
+    FUNCTIONS,
+    MEMORIES,
+    NAMES,
+    TABLE,
+    Curve,
+    StatefulFunction,
+    Value,
+    ValueUnit,
+    unit_of,
+)
 from multidrop.channels.grammar import (
     CallStep,
     ExpressionError,
@@ -18,7 +29,6 @@ from multidrop.channels.grammar import (
     TextStep,
     parse,
 )
-from multidrop.channels.units import ValueUnit, unit_of
 from multidrop.core.columns import NumberFormat
 from multidrop.drive.register import Access, Register
 from multidrop.drive.register import Table as AddressTable
