@@ -12,8 +12,8 @@ from typing import NamedTuple
 from multidrop.core import Completion, Exchange, Framing, Peer, TransactionIds, is_pseudo_terminal
 from multidrop.drive.family import Drive, check_drive
 from multidrop.errors import NotAttached
+from multidrop.planning.blocks import proofs
 from multidrop.planning.bus_time import silence
-from multidrop.planning.proofs import proofs
 from multidrop.transport import clock, port_identity
 from multidrop.transport.line import Line
 from multidrop.transport.prepared import NO_ROWS, make_exchange
