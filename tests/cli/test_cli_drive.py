@@ -23,7 +23,7 @@ from toy import Status, Toy
 import multidrop.cli
 from multidrop.cli.support.output import confirm
 from multidrop.cli.support.values import nearest_value
-from multidrop.control import eeprom_ledger as ledger
+from multidrop.control import records
 from multidrop.core import Message
 from multidrop.errors import WriteForbidden
 from multidrop.families.innovert_ibd import InnovertIBD
@@ -320,10 +320,9 @@ def test_every_write_is_recorded_in_the_audit_log(run: Run, port: str, tmp_path:
     run("set-frequency", port, TOY, 1, 20, "--yes", "--audit", log)
     run("start", port, TOY, 1, "--yes", "--audit", log)
     run("stop", port, TOY, 1, "--audit", log)
-    records = [json.loads(line) for line in log.read_text().splitlines()]
+    noted = [json.loads(line) for line in log.read_text().splitlines()]
     assert [
-        (record["drive"], record["write"], record.get("sent", "")[:17], record["outcome"])
-        for record in records
+        (record["drive"], record["write"], record.get("sent", "")[:17], record["outcome"]) for record in noted
     ] == [
         ("toy@1", "frequency = 20.00 Hz", "01 06 00 15 07 D0", "done"),
         ("toy@1", "control = RUNNING", "01 06 00 14 00 01", "done"),
@@ -371,15 +370,15 @@ def test_the_command_wear_shows_the_eeprom_ledger(run: Run, port: str, toy: Simu
     assert (status, out) == (1, "")
     assert "is written once in 60 s at most" in err
     assert "no writes to EEPROM yet" in run("wear")[1]  # writes to a simulated drive are not counted
-    assert not ledger.Ledger().enter(
-        ledger.LedgerCell("/dev/ttyS7", 1, "toy", "acceleration_time"), time.time(), 60.0
+    assert not records.Ledger().enter(
+        records.LedgerCell("/dev/ttyS7", 1, "toy", "acceleration_time"), time.time(), 60.0
     )
     head, row, *_ = run("wear")[1].splitlines()
     assert head.split() == ["PORT", "ADDRESS", "MODEL", "REGISTER", "WRITES", "THIS", "YEAR", "LEFT", "LAST"]
     assert row.split()[:7] == ["/dev/ttyS7", "1", "toy", "acceleration_time", "1", "1", "999"]
     (wear,) = json.loads(run("wear", "--json")[1])
     assert (wear["register"], wear["writes"], wear["left"]) == ("acceleration_time", 1, 999)
-    ledger.Ledger().enter(ledger.LedgerCell("/dev/ttyS7", 2, "meter: Meter 2", "period"), time.time(), 60.0)
+    records.Ledger().enter(records.LedgerCell("/dev/ttyS7", 2, "meter: Meter 2", "period"), time.time(), 60.0)
     assert run("wear")[1].splitlines()[2].split()[:4] == ["/dev/ttyS7", "2", "meter", "period"]
 
 

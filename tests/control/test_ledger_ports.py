@@ -17,8 +17,8 @@ from tables import table
 from toy import Status, Toy
 
 from multidrop.bus import Bus
-from multidrop.control import eeprom_ledger
-from multidrop.control.eeprom_ledger import Ledger, LedgerCell, default_path
+from multidrop.control import records
+from multidrop.control.records import Ledger, LedgerCell, default_ledger_path
 from multidrop.drive import Drive
 from multidrop.drive.register import COIL, Kept, setting
 from multidrop.errors import WriteForbidden
@@ -174,7 +174,7 @@ def test_a_user_without_a_home_can_stop_drives_but_not_write_eeprom(monkeypatch:
     monkeypatch.delenv("XDG_STATE_HOME", raising=False)
     monkeypatch.setattr(Path, "home", home)
     # root could create the default path
-    monkeypatch.setattr(eeprom_ledger, "NO_HOME", Path("/dev/null"), raising=False)
+    monkeypatch.setattr(records, "NO_HOME", Path("/dev/null"), raising=False)
     toy = simulated(Toy(1))
     toy["status"] = Status(0)
     line = SimulatedBus(toy)
@@ -195,7 +195,7 @@ def test_writes_to_a_simulated_drive_are_not_in_the_user_s_ledger(tmp_path: Path
         with pytest.raises(WriteForbidden, match="is written once in 60 s at most"):
             write(path, 13.0)
     assert Ledger().wear(0) == []
-    assert not list(default_path().parent.rglob("*.sqlite"))
+    assert not list(default_ledger_path().parent.rglob("*.sqlite"))
 
 
 @with_names

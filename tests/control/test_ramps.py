@@ -18,8 +18,8 @@ from stop_frames import all_stopped, che_drives, starts
 from tables import table
 from toy import Toy
 
-from multidrop.control.eeprom_ledger import Ledger
 from multidrop.control.ramp import ramp, start_staggered
+from multidrop.control.records import Ledger
 from multidrop.core import Message
 from multidrop.drive import Direction, Drive, Script, read
 from multidrop.drive.register import Kept, command, setting

@@ -28,7 +28,7 @@ from terminals import on_terminal
 
 from multidrop.cli.fleet import demo
 from multidrop.cli.fleet.demo import Stage, plant_file
-from multidrop.control import eeprom_ledger
+from multidrop.control import records
 from multidrop.plant.loader import load_plant
 
 
@@ -85,7 +85,7 @@ def test_without_a_home_folder_a_stop_is_still_sent(
 
     monkeypatch.delenv("XDG_STATE_HOME")
     monkeypatch.setattr(Path, "home", none)
-    monkeypatch.setattr(eeprom_ledger, "NO_HOME", Path("/dev/null"))  # not even root can create this path
+    monkeypatch.setattr(records, "NO_HOME", Path("/dev/null"))  # not even root can create this path
     status, out, err = run("fleet", *words, "--nats", nobody)
     assert (status, out) == (1, "")
     assert f"no NATS server answers at {nobody}: Connection refused" in err

@@ -17,7 +17,7 @@ from multidrop.cli.support.arguments import (
 )
 from multidrop.cli.support.output import confirm, print_json, print_text, reporting_interruption
 from multidrop.cli.support.values import Row, aligned, as_json, as_row, nearest_value, user_title
-from multidrop.control.eeprom_ledger import BUDGET, CYCLES, Ledger, Wear, default_path
+from multidrop.control.records import BUDGET, CYCLES, Ledger, Wear, default_ledger_path
 from multidrop.control.rules import check_plain, raw_count, refused
 from multidrop.core import Status, utc_minus_monotonic_ns
 from multidrop.drive.family import Drive
@@ -143,7 +143,7 @@ WEAR_HEAD = ("PORT", "ADDRESS", "MODEL", "REGISTER", "WRITES", "THIS YEAR", "LEF
 
 def _run_wear(arguments: argparse.Namespace) -> int:
     if arguments.ledger and not Path(arguments.ledger).is_file():
-        raise ValueError(f"there is no ledger {arguments.ledger}; the default is {default_path()}")
+        raise ValueError(f"there is no ledger {arguments.ledger}; the default is {default_ledger_path()}")
     ledger = Ledger(arguments.ledger)
     found = ledger.wear((now_ns() + utc_minus_monotonic_ns()) / 1e9)
     if arguments.json:

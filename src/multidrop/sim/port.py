@@ -8,7 +8,7 @@ import socket
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from multidrop.control.eeprom_ledger import default_path
+from multidrop.control.records import default_ledger_path
 from multidrop.core import get_settings, set_settings
 from multidrop.drive.line_settings import Settings
 from multidrop.transport.port_identity import SimulatedPort, is_simulated, of_address
@@ -41,7 +41,7 @@ class PtyPort:
             os.set_blocking(self._master, False)
             set_settings(self._slave, settings.baudrate, settings.format)
             self.path = os.ttyname(self._slave)
-            self._simulated = SimulatedPort(self.path, default_path().parent)
+            self._simulated = SimulatedPort(self.path, default_ledger_path().parent)
             if link is not None:
                 if is_dead_link(link):
                     link.unlink()
@@ -91,7 +91,7 @@ class TCPPort:
         self._client: socket.socket | None = None
         host, port, *_ = self._listener.getsockname()
         near = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
-        self._simulated = SimulatedPort(of_address((near, port)), default_path().parent)
+        self._simulated = SimulatedPort(of_address((near, port)), default_ledger_path().parent)
         self.path = f"{parts.scheme}://{parts.hostname}:{self._listener.getsockname()[1]}"
 
     def fileno(self) -> int:

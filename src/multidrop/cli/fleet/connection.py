@@ -13,7 +13,7 @@ from multidrop.cli.support.arguments import add_json_argument
 from multidrop.cli.support.files import require_extra
 from multidrop.cli.support.output import logging_to, warn
 from multidrop.cli.support.signals import run_loop
-from multidrop.control.eeprom_ledger import default_path
+from multidrop.control.records import default_ledger_path
 from multidrop.printable import masked
 
 URLS = "nats://127.0.0.1:4222"
@@ -94,7 +94,7 @@ def state_folder() -> Path:
     The EEPROM ledger is beside this folder. A user without a home folder cannot keep a ledger, but stops do
     not need a ledger.
     """
-    return default_path().parent / "fleet"
+    return default_ledger_path().parent / "fleet"
 
 
 def require_fleet(command: str = "fleet") -> None:
