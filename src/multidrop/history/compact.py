@@ -18,7 +18,7 @@ from typing import Any
 
 from multidrop.history.database import Database, copy_out, insert, insert_units, kept_metadata, with_units
 from multidrop.history.folder import STEM, HistoryFile, file_name, parquet_files, widest
-from multidrop.history.quantities import units_of
+from multidrop.history.units import unit_texts_of
 from multidrop.polling.batch import Rows
 from multidrop.recording.arrows import ArrowsReader
 from multidrop.recording.segments import FileLock, segments_of
@@ -141,7 +141,7 @@ def _compact_segment(database: Database, folder: Path, number: int, path: Path) 
             damage.append(str(error))
         else:
             insert(cursor, _readable(reader, damage))
-            insert_units(cursor, units_of(metadata))
+            insert_units(cursor, unit_texts_of(metadata))
             cursor.execute(WITH_UNITS)
             bounds = "select min(epoch_ns(time)), max(epoch_ns(time)), count(*) from recorded"
             least, most, rows = cursor.execute(bounds).fetchone()

@@ -11,7 +11,7 @@ from tempfile import mkdtemp
 from typing import Any
 
 from multidrop.extras import install_command
-from multidrop.history.quantities import Series
+from multidrop.history.units import Series
 from multidrop.polling.batch import Rows, assemble, schema
 from multidrop.recording.format import METADATA_KEY, Metadata
 from multidrop.recording.rows import RecordedRows

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from multidrop.core.columns import find_codes
 from multidrop.history.buckets import Accumulator, Grid
 from multidrop.history.folder import TEN_NS
-from multidrop.history.quantities import Series
+from multidrop.history.units import Series
 from multidrop.polling.batch import Row
 from multidrop.recording.arrow_decoder import RecordedColumns
 from multidrop.recording.arrows import ArrowsTail, BatchPlace

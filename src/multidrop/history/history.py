@@ -10,15 +10,6 @@ from pathlib import Path
 from multidrop.history.buckets import Buckets, Grid, UnitBuckets, grid_of
 from multidrop.history.database import MissingDuckDB
 from multidrop.history.folder import HistoryFile, Listing, listing
-from multidrop.history.quantities import (
-    Moment,
-    OtherColumn,
-    Series,
-    UnitHistory,
-    ns_of,
-    parsed_series,
-    units_of,
-)
 from multidrop.history.sources import (
     ALWAYS,
     MOST_TRIES,
@@ -31,6 +22,15 @@ from multidrop.history.sources import (
     rows_of_file,
     units_in_rows,
     write_parquet,
+)
+from multidrop.history.units import (
+    Moment,
+    OtherColumn,
+    Series,
+    UnitHistory,
+    ns_of,
+    parsed_series,
+    unit_texts_of,
 )
 from multidrop.polling.batch import Row, Rows
 from multidrop.recording import open_writer
@@ -106,7 +106,7 @@ class History:
         return HistoryRows(self, parsed_series(series), first, ALWAYS[1] if end is None else ns_of(end))
 
     def unit_history_of(self, series: Sequence[Series] | None, begin: int, end: int) -> UnitHistory:
-        """Return the newest and the earlier quantities of the series (None: all series) in this range."""
+        """Return the newest and the earlier units of the series (None: all series) in this range."""
         units = UnitHistory({}, series)
         self._sources.again(lambda found: self._learnt(found, series, begin, end, units))
         return units
@@ -139,7 +139,7 @@ class History:
     def _learnt(
         self, found: Listing, series: Sequence[Series] | None, begin: int, end: int, units: UnitHistory
     ) -> Listing:
-        """Add the quantities of all listed segments to `units`, and return the listing."""
+        """Add to `units` the units of all listed segments, and return the listing."""
         known = self._sources.known(found, begin, end)
         new = units.unknown_of(known)
         if files := [found.rows[number] for number in new if number in found.rows and not known[number]]:
@@ -156,15 +156,15 @@ class History:
         end: int,
         units: UnitHistory,
     ) -> Iterator[Rows]:
-        file, renamed = found.rows.get(number), units.renamed(number)
+        file, others = found.rows.get(number), units.other_columns(number)
         if file and file.may_have(begin, end):
-            yield from rows_of_file(self._sources, file, series, begin, end, renamed)
+            yield from rows_of_file(self._sources, file, series, begin, end, others)
         elif number in found.segments:
             wanted = None if series is None else frozenset(series)
             with self._sources.segment(number, found, begin, end) as segment:
                 for batch in segment.batches(begin, end) if segment else ():
                     if segment and (rows := segment.rows_of(batch, wanted, begin, end)):
-                        yield from_rows(_renamed(rows, renamed))
+                        yield from_rows(_renamed(rows, others))
 
     # ---- buckets ----
 
@@ -229,7 +229,7 @@ class History:
     ) -> Iterator[bytes]:
         """Yield the rows that `read` returns as pieces of a .csv file with a column `unit`."""
         rows = self.read(series, begin, end)
-        units = units_of(rows.metadata)
+        units = unit_texts_of(rows.metadata)
         lines = (lines_with_units(batch, units) for batch in rows)
         return (piece for pieces in ([WITH_UNITS.encode()], lines) for piece in pieces)
 
@@ -272,8 +272,8 @@ class History:
                 )
             )
             self._learnt(found, rows.series, rows.begin, rows.end, rows.units)
-            renamed = {file.first: rows.units.renamed(file.first) for file in files}
-            of = rows.series, (rows.begin, rows.end), rows.metadata, renamed
+            others = {file.first: rows.units.other_columns(file.first) for file in files}
+            of = rows.series, (rows.begin, rows.end), rows.metadata, others
             return write_parquet(self._sources, target, batches, files, *of)
 
         self._sources.cursor().close()  # raises MissingDuckDB before a file is created

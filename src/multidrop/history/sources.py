@@ -23,7 +23,7 @@ from multidrop.history.database import (
 )
 from multidrop.history.folder import HistoryFile, Listing, listing
 from multidrop.history.growing import GrowingSegment
-from multidrop.history.quantities import Known, OtherColumn, Quantity, Series, known_by
+from multidrop.history.units import FileUnits, OtherColumn, Series, SeriesUnit, file_units_of
 from multidrop.polling.batch import Rows
 from multidrop.recording.format import Metadata
 
@@ -36,7 +36,7 @@ FILES_AT_ONCE = 200  # files per query of metadata, because a file's metadata ma
 
 
 class Replaced(Exception):
-    """A listed file no longer exists, because its rows were moved to another file or were too old."""
+    """Raised if a listed file no longer exists, because it was merged into another file or was too old."""
 
 
 class Sources:
@@ -47,7 +47,7 @@ class Sources:
         self.damage: dict[int, str] = {}  # a sentence for each damaged segment, by number
         self._growing: dict[int, GrowingSegment] = {}
         self._bounds: dict[int, tuple[int, int]] = {}  # first and last time of each closed segment
-        self._known: dict[int, Known] = {}  # quantities by segment number
+        self._known: dict[int, FileUnits] = {}  # each segment's units, by segment number
         self._changing = threading.Lock()
         self._database = Database(MEMORY)
 
@@ -69,7 +69,8 @@ class Sources:
     def segment(self, number: int, found: Listing, begin: int, end: int) -> Iterator[GrowingSegment | None]:
         """Yield a segment that was read up to its current end, and whose file stays open in the `with` block.
 
-        Yield None if the segment has no rows in this range or cannot be read. Raises Replaced.
+        Yield None if the segment has no rows in this range or cannot be read. Raises Replaced if its file no
+        longer exists.
         """
         segment: GrowingSegment | None = None
         with self._changing:
@@ -98,8 +99,8 @@ class Sources:
                 segment = GrowingSegment(path)
             except FileNotFoundError:
                 raise Replaced from None
-            # not for an empty file: its start was not written yet, or was lost in a power cut
             except ValueError as error:
+                # An empty file is not damaged: it was just created, or its data was lost in a power cut.
                 if path.exists() and path.stat().st_size:
                     self.damage[number] = str(error)
                 return None
@@ -113,27 +114,30 @@ class Sources:
             self._growing.pop(older).let_go()
         return segment
 
-    def known(self, found: Listing, begin: int, end: int) -> dict[int, Known]:
-        """Return the quantities of each segment that may have rows in this range. Raises Replaced."""
+    def known(self, found: Listing, begin: int, end: int) -> dict[int, FileUnits]:
+        """Return the units in each segment that may have rows in this range.
+
+        Raises Replaced if a file no longer exists.
+        """
         files = {number: file for number, file in found.rows.items() if file.may_have(begin, end)}
         unread = [file for number, file in files.items() if number not in self._known]
         for at in range(0, len(unread), FILES_AT_ONCE):
-            self._read_quantities(unread[at : at + FILES_AT_ONCE])
+            self._read_units(unread[at : at + FILES_AT_ONCE])
         numbers = [*files]
         for number in found.segments:
             with self.segment(number, found, begin, end) as segment:
                 if segment and segment.batches(begin, end):
                     numbers.append(number)
                     if number not in self._known:
-                        self._known[number] = known_by(segment.metadata)
+                        self._known[number] = file_units_of(segment.metadata)
         return {number: self._known[number] for number in numbers}
 
-    def _read_quantities(self, files: Sequence[HistoryFile]) -> None:
+    def _read_units(self, files: Sequence[HistoryFile]) -> None:
         numbers = {str(file.path): file.first for file in files}
-        read: dict[int, Known] = {number: {} for number in numbers.values()}
+        read: dict[int, FileUnits] = {number: {} for number in numbers.values()}
         with self.cursor() as cursor, while_there(files):
             for text, paths in texts_of_metadata(cursor, [file.path for file in files]):
-                known = known_by(_parsed(text))
+                known = file_units_of(_parsed(text))
                 read |= {numbers[path]: known for path in paths}
         self._known |= read
 
@@ -194,18 +198,19 @@ def rows_of_file(
     series: Sequence[Series] | None,
     begin: int,
     end: int,
-    renamed: Iterable[OtherColumn],
+    others: Iterable[OtherColumn],
 ) -> Iterator[Rows]:
     """Yield the rows of the series (None: all series) by request time.
 
-    Raises Replaced, but only before the first row.
+    Raises Replaced if the file no longer exists, but only before the first row.
     """
     condition, values = _condition(series)
-    # a file of several segments is from `multidrop hub`: monotonic times of several computers do not compare
+    # Only `multidrop hub` writes files with several segments. Their rows come from several computers, whose
+    # monotonic clocks differ, so sort them by UTC.
     order = "monotonic_ns" if file.first == file.last else "time"
     with sources.cursor() as cursor, while_there([file]):
         # Sorting reads the whole file before the first row, so Replaced cannot be raised between rows.
-        query = _ROWS.format(_columns(renamed), with_units([file.path]), condition) + f" order by {order}"
+        query = _ROWS.format(_columns(others), with_units([file.path]), condition) + f" order by {order}"
         yield from rows_of(cursor, query, {"begin": begin, "end": end, **values})
 
 
@@ -217,10 +222,10 @@ def gather_files(
     grid: Grid,
     described: Container[Series],
 ) -> None:
-    """Add the rows, or the ten-second summaries, in these files to the buckets. Raises Replaced.
+    """Add the rows, or the ten-second summaries, in these files to the buckets.
 
     The column `unit` is read only if the metadata does not describe all series, because reading it doubles
-    the time.
+    the time. Raises Replaced if a file no longer exists.
     """
     condition, values = _condition(list(into))
     values |= {"begin": grid.begin, "end": grid.end, "step": grid.step}
@@ -236,23 +241,23 @@ def gather_files(
 
 def units_in_rows(
     sources: Sources, files: Sequence[HistoryFile], series: Sequence[Series] | None, begin: int, end: int
-) -> dict[int, Known]:
-    """Return the quantities in each file's column `unit`, by the number of its first segment.
+) -> dict[int, FileUnits]:
+    """Return each file's units, from its column `unit`; the key is the number of the file's first segment.
 
-    Raises Replaced.
+    Raises Replaced if a file no longer exists.
     """
     condition, values = _condition(series)
     query = _UNITS.format(files=with_units(file.path for file in files), condition=condition)
-    known: dict[str, dict[Series, list[Quantity]]] = {str(file.path): {} for file in files}
+    known: dict[str, dict[Series, list[SeriesUnit]]] = {str(file.path): {} for file in files}
     values |= {"begin": begin, "end": end}
     with sources.cursor() as cursor, while_there(files):
         for path, drive, register, unit in cursor.execute(query, values).fetchall():
-            known[path].setdefault((drive, register), []).append(Quantity(unit))
+            known[path].setdefault((drive, register), []).append(SeriesUnit(unit))
     return {file.first: known[str(file.path)] for file in files}
 
 
 def metadata_of(sources: Sources, file: HistoryFile) -> Metadata:
-    """Return the metadata of a file's segment. Raises Replaced."""
+    """Return the metadata of a file's segment. Raises Replaced if the file no longer exists."""
     with sources.cursor() as cursor, while_there([file]):
         return kept_metadata(cursor, file.path)
 
@@ -265,12 +270,12 @@ def write_parquet(
     series: Sequence[Series] | None,
     range_ns: tuple[int, int],
     metadata: Metadata,
-    renamed: Mapping[int, Iterable[OtherColumn]],
+    others: Mapping[int, Iterable[OtherColumn]],
 ) -> int:
-    """Write a Parquet file with these batches and the rows of `files` in this range, for these series.
+    """Write these batches, and the rows of these series and this range in `files`, to a Parquet file.
 
-    `renamed` maps the first segment of a file to the columns that `rows_of_file` takes. Return the number of
-    rows. Raises Replaced.
+    `others` are the columns for values in earlier units, by the number of a file's first segment. Return the
+    number of rows. Raises Replaced if a file no longer exists.
     """
     condition, values = _condition(series)
     values |= dict(zip(("begin", "end"), range_ns, strict=True))
@@ -279,19 +284,19 @@ def write_parquet(
         query = f"select {COLUMNS} from recorded"
         alike: dict[str, list[HistoryFile]] = {}
         for file in files:
-            alike.setdefault(_columns(renamed[file.first]), []).append(file)
+            alike.setdefault(_columns(others[file.first]), []).append(file)
         for columns, some in alike.items():
             found = _ROWS.format(columns, with_units(file.path for file in some), condition)
             query += f" union all by name {found}"
         return copy_out(cursor, query, target, metadata, values if files else {})
 
 
-def _columns(renamed: Iterable[OtherColumn]) -> str:
+def _columns(others: Iterable[OtherColumn]) -> str:
     """Return SQL to append to `select *`, which renames registers to these columns."""
     whens = " ".join(
         f"when drive = {quoted(drive)} and register = {quoted(register)}"
         f"{'' if unit is None else f' and unit = {quoted(unit)}'} then {quoted(name)}"
-        for (drive, register), unit, name in renamed
+        for (drive, register), unit, name in others
     )
     return f"replace (case {whens} else register end as register)" if whens else ""
 

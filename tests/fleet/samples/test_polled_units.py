@@ -26,7 +26,9 @@ from multidrop.fleet.samples.hub import Commit, ParquetSink
 from multidrop.fleet.samples.samples_stream import StreamMessage, read_after
 from multidrop.fleet.servers.buckets import Record
 from multidrop.fleet.servers.plant_store import line_of
-from multidrop.history import compact, quantities
+from multidrop.history import compact
+from multidrop.history.units import RAW as HISTORY_RAW
+from multidrop.history.units import unit_texts_of
 from multidrop.samples.message import RAW, PolledUnits, RowBuffer, unpack
 
 FAMILY = """
@@ -120,8 +122,8 @@ def test_merged_files_keep_units_even_if_some_rows_have_no_unit(tmp_path: Path) 
 
 def test_a_unit_has_the_same_name_in_a_gateway_and_in_a_history() -> None:
     plant = {"drives": {"a": {"model": "meter.toml", "registers": {"b": {"values": {"ON": 1}}}}}}
-    assert quantities.units_of(plant) == {("a", "b"): "names of meter.toml"}
-    assert RAW == quantities.RAW
+    assert unit_texts_of(plant) == {("a", "b"): "names of meter.toml"}
+    assert RAW == HISTORY_RAW
 
 
 @pytest.fixture(params=["as they came", "merged"])

@@ -24,7 +24,7 @@ from multidrop.fleet.lines.member import MemberState
 from multidrop.gateway.http.files import PAGE, read_files
 from multidrop.gateway.http.rights import Right
 from multidrop.gateway.live import alarms, hub
-from multidrop.history.quantities import RAW
+from multidrop.history.units import RAW
 
 LANGUAGES = {"ru", "zh"}
 CATALOGUE = (PAGE / "texts.toml").read_text("utf-8")

@@ -14,7 +14,7 @@ from multidrop import History
 from multidrop.core.columns import Names
 from multidrop.history import Buckets, HistoryWriter
 from multidrop.history.compact import compact
-from multidrop.history.quantities import quantities_of
+from multidrop.history.units import units_by_series
 from multidrop.polling.batch import Row, Rows
 from multidrop.recording.rows import from_rows
 from multidrop.recording.segments import SegmentWriter
@@ -120,8 +120,8 @@ def test_units_are_not_read_from_invalid_metadata() -> None:
         {"drives": {"pump-1": None}},
         {"drives": {"a": {"registers": 3}}},
     ):
-        assert quantities_of(strange) == {}
-    assert quantities_of({"drives": {"a": {"registers": {"b": 3, "c": {"values": [1]}}}}}).keys() == {
+        assert units_by_series(strange) == {}
+    assert units_by_series({"drives": {"a": {"registers": {"b": 3, "c": {"values": [1]}}}}}).keys() == {
         ("a", "c")
     }
 
