@@ -92,9 +92,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     others = iter([item for item in items if not item.get_closest_marker("slow")])
     dealt: list[pytest.Item] = []
     for worker in range(workers):
-        share = (len(items) - len(dealt)) // (
-            workers - worker
-        )  # tests that --dist worksteal gives this worker
+        # the number of tests that pytest-xdist (--dist worksteal) assigns to this worker at the start
+        share = (len(items) - len(dealt)) // (workers - worker)
         begins = slow[worker::workers]
         dealt += [*begins, *islice(others, max(0, share - len(begins)))]
     items[:] = [*dealt, *others]

@@ -8,8 +8,9 @@ def main() -> int:
     try:
         from multidrop.cli import main
     except (KeyboardInterrupt, RuntimeError) as interruption:
+        # Ctrl-C in a class statement may raise a RuntimeError; its cause is then the KeyboardInterrupt.
         if not isinstance(interruption.__cause__ or interruption, KeyboardInterrupt):
-            raise  # not Ctrl-C: inside a class statement, Python turns Ctrl-C into a RuntimeError
+            raise
         print("multidrop: interrupted", file=sys.stderr)
         return 130
     return main()

@@ -184,7 +184,7 @@ class Advice(NamedTuple):
 
     @classmethod
     def call(cls, verb: str) -> Advice:
-        """Return the advice to call a verb of the drive."""
+        """Return the advice to call this method of the drive, or to run the command of the same name."""
         return cls(f"call {verb}()", f"run `multidrop {verb.replace('_', '-')}`")
 
     @classmethod

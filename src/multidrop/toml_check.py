@@ -107,13 +107,13 @@ class TomlPlace:
 
     @classmethod
     def in_file(cls, path: Path) -> TomlPlace:
-        """Return the place of a whole file. Errors then have line numbers; the first error reads the file."""
+        """Return the place of a whole file. For line numbers, the file is read at the first error."""
         return cls(path, lines=cache(partial(line_numbers, path)))
 
     def inside(self, kind: str, tables: list[Any], key: str = "") -> Iterator[tuple[Any, TomlPlace]]:
-        """Yield each table with its place, which is labelled with the table's name or else its number.
+        """Yield each table of an array with its place. The label is `kind` and the table's name or number.
 
-        `key` is the key of the tables, if it is not `kind`.
+        `key` is the array's key in the file if it differs from `kind`.
         """
         for number, table in enumerate(tables, 1):
             name = table.get("name") if isinstance(table, dict) else None
@@ -122,7 +122,7 @@ class TomlPlace:
             yield table, replace(self, labels=(*self.labels, label), steps=steps)
 
     def within(self, label: str, *tables: str) -> TomlPlace:
-        """Return the place of a table inside this place; `tables` are the keys that lead to it."""
+        """Return the place, labelled `label`, of the subtable under the keys `tables`."""
         steps = (*self.steps, *((table, 1) for table in tables))
         return replace(self, labels=(*self.labels, label), steps=steps)
 
@@ -284,11 +284,12 @@ def ascending() -> dict[str, Any]:
 
 
 def distinct() -> dict[str, Any]:
-    """Return the JSON Schema "distinct", of a table whose values are different whole numbers, and its parts.
+    """Return the JSON Schema "distinct", and the schemas to which it refers.
 
-    A JSON Schema cannot compare the values of unknown names. It can compare two groups of names: if a number
-    is the value of a name in one group, it is not that of a name in the other. The groups are names with
-    different first or last characters. Most pairs of names are in different groups at least once.
+    It accepts tables such as { stopped = 0, running = 1 } if no two names have the same whole number. A JSON
+    Schema cannot compare the values of names that it does not know. But it can divide the names into two
+    groups by their first or last character, and reject a number that both groups have. It does so for several
+    pairs of groups, so that most pairs of names are in different groups at least once.
     """
     letters = [f"{small}{small.upper()}" for small in ascii_lowercase]
     characters = [*letters, "_", *digits]
@@ -297,7 +298,7 @@ def distinct() -> dict[str, Any]:
         for bit in range(len(characters).bit_length())
     ]
     groups = [[form.format(half) for half in each] for form in ("^[{}]", "[{}]$") for each in halves]
-    # only these values are compared: all bit numbers of a word, and most raw values with names
+    # the schema detects duplicates of these numbers: all bit numbers, and most raw counts that have a name
     numbers = range(16)
     parts: dict[str, Any] = {
         f"not-{number}": {"not": {"const": number, "description": f"another name has the number {number}"}}

@@ -7,18 +7,16 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 MOST_SHOWN = 40  # limit of the shown characters of a line
-MOST_MATCHED = 1000  # limit of the matched characters of a line: some patterns take the square of its length
+MOST_MATCHED = 1000  # limit of a line's characters: the time of some patterns grows with their square
 
 
 class _Cause(NamedTuple):
-    """A frequent mistake: patterns of tomllib's message and of the whole wrong line, and a sentence.
+    """A frequent mistake in TOML files, and its explanation."""
 
-    The sentence may use the groups of the line's pattern. `rest` is the line from the wrong column on, and
-    `first` names the earlier line that has the same key or header.
-    """
-
-    message: str
-    line: str
+    message: str  # regular expression for tomllib's message
+    line: str  # regular expression for the whole wrong line
+    # The explanation. It may contain groups of `line`, {rest} (the line from the wrong column on) and {first}
+    # (", first in line 5", if line 5 has the same key or header).
     sentence: str
 
 

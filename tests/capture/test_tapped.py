@@ -202,7 +202,9 @@ def epoch(time_ns: int) -> str:
 @pytest.mark.parametrize(
     "make", [pytest.param(rough_wires, id="rough"), pytest.param(echoing_wires, id="echoing")]
 )
-def test_a_disturbed_lines_capture_has_polled_rows(tmp_path: Path, make: Callable[[], list[Wire]]) -> None:
+def test_a_capture_of_a_disturbed_line_has_the_polled_rows(
+    tmp_path: Path, make: Callable[[], list[Wire]]
+) -> None:
     drives = [polled(drive, drive.readings()) for drive in fast_drives()]
     rows, decoded = captured(tmp_path / "a.pcapng", make, drives, FATES)
     check(rows, decoded)

@@ -38,7 +38,7 @@ def fan(tmp_path: Path) -> Path:
     return path
 
 
-def test_check_lists_registers_unknown_facts_and_forbidden_writes(run: Run, fan: Path) -> None:
+def test_the_check_command_lists_unknown_facts_and_forbidden_writes(run: Run, fan: Path) -> None:
     status, out, err = run("check", fan)
     shown = words(out)
     assert (status, err) == (0, "")
@@ -66,20 +66,20 @@ def test_check_lists_registers_unknown_facts_and_forbidden_writes(run: Run, fan:
         assert told in refused
 
 
-def test_check_refuses_an_address_in_place_of_a_file(run: Run) -> None:
+def test_the_check_command_refuses_an_address_in_place_of_a_file(run: Run) -> None:
     told = "http://10.0.0.7:8750 is an address, not a plant file; a gateway's page is for a browser: "
     for command in ("check", "plan", "poll", "simulate"):
         assert run(command, "http://10.0.0.7:8750") == (2, "", f"multidrop: {told}open it there\n")
 
 
-def test_check_accepts_the_name_of_a_family_that_ships_as_a_file(run: Run) -> None:
+def test_the_check_command_accepts_the_name_of_a_family_that_ships_as_a_file(run: Run) -> None:
     status, out, _ = run("check", "abb-acs355")
     assert status == 0
     assert "No mistake found in abb-acs355" in words(out)
     assert max(map(len, out.splitlines())) <= 80
 
 
-def test_check_hints_at_the_right_name_or_command(run: Run, tmp_path: Path) -> None:
+def test_the_check_command_hints_at_the_right_name_or_command(run: Run, tmp_path: Path) -> None:
     assert "see `multidrop models innovert-ibd`" in run("check", "innovert-ibd")[2]
     assert "did you mean abb-acs355" in run("check", "abb-acs35")[2]
     (tmp_path / "plant.toml").write_text('[[line]]\nname = "L"\n')
@@ -90,7 +90,7 @@ def test_check_hints_at_the_right_name_or_command(run: Run, tmp_path: Path) -> N
     ]
 
 
-def test_models_prints_bits_and_addresses_in_the_notation_of_manuals(run: Run, tmp_path: Path) -> None:
+def test_the_models_command_prints_bits_and_addresses_as_in_manuals(run: Run, tmp_path: Path) -> None:
     """Bits have numbers, and registers have hex addresses. Only a family with verbs has a watchdog."""
     _, out, _ = run("check", "abb-acs355")
     assert "bit 0 READY_TO_SWITCH_ON, bit 1 READY_TO_OPERATE" in words(out)
@@ -103,7 +103,7 @@ def test_models_prints_bits_and_addresses_in_the_notation_of_manuals(run: Run, t
     assert "01F3H serial_number input register 8 characters" in words(run("models", path)[1])
 
 
-def test_check_prints_a_family_as_json(run: Run, fan: Path) -> None:
+def test_the_check_command_prints_a_family_as_json(run: Run, fan: Path) -> None:
     status, out, _ = run("check", fan, "--json")
     found = json.loads(out)
     assert (status, found["model"], found["declared_in"], found["mistakes"]) == (
@@ -115,7 +115,7 @@ def test_check_prints_a_family_as_json(run: Run, fan: Path) -> None:
     assert ["identify", "how to recognise this device; read its name plate"] in found["not_known"]
 
 
-def test_check_prints_all_mistakes_and_returns_1(run: Run, tmp_path: Path) -> None:
+def test_the_check_command_prints_all_mistakes_and_returns_1(run: Run, tmp_path: Path) -> None:
     path = tmp_path / "fan.toml"
     path.write_text(FAN.replace("0x0010", '"8192"').replace("0x0020", "-1"))
     status, out, err = run("check", path)
@@ -128,7 +128,7 @@ def test_check_prints_all_mistakes_and_returns_1(run: Run, tmp_path: Path) -> No
     assert (status, len(json.loads(out)["mistakes"])) == (1, 2)
 
 
-def test_models_warns_that_a_family_file_is_not_tested(run: Run, tmp_path: Path) -> None:
+def test_the_models_command_warns_that_a_family_file_is_not_tested(run: Run, tmp_path: Path) -> None:
     path = write_meter(tmp_path)
     status, out, _ = run("models", path)
     assert status == 0
@@ -145,7 +145,7 @@ def test_a_family_file_with_mistakes_makes_models_return_2(run: Run, tmp_path: P
     assert "'manual' is missing" in err
 
 
-def test_check_warns_of_a_line_with_too_many_drives(run: Run, tmp_path: Path) -> None:
+def test_the_check_command_warns_of_a_line_with_too_many_drives(run: Run, tmp_path: Path) -> None:
     """The manual of ERMAN, section 1, allows at most 31 devices, including the drive itself."""
     plant = tmp_path / "plant.toml"
 
@@ -181,7 +181,7 @@ def test_mistakes_of_a_family_file_are_reported_once_for_all_drives(run: Run, tm
     assert all('plant.toml:6: line "L", drive "f1": ' in line for line in reported)
 
 
-def test_check_does_not_ask_for_the_value_range_of_a_coil(run: Run, tmp_path: Path) -> None:
+def test_the_check_command_does_not_ask_for_the_value_range_of_a_coil(run: Run, tmp_path: Path) -> None:
     path = tmp_path / "io.toml"
     path.write_text(
         '[family]\ntitle = "IO"\nmanual = "v1"\n[setting]\nlamp = { at = "00001", place = "1" }\n'

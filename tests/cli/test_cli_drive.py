@@ -38,7 +38,7 @@ pytestmark = pytest.mark.usefixtures("_turns_awaited")
 DOG = "watchdog: The document names no watchdog: the motor runs on when the client dies."
 
 
-def test_read_prints_all_readings_and_settings_with_units(run: Run, port: str) -> None:
+def test_the_read_command_prints_all_readings_and_settings_with_units(run: Run, port: str) -> None:
     assert run("read", port, TOY, 1) == (
         0,
         "output_frequency      49.9  Hz\n"
@@ -72,12 +72,12 @@ def test_titles_are_printed_in_the_language_of_the_environment(
     assert title in out
 
 
-def test_read_prints_registers_in_the_given_order(run: Run, port: str) -> None:
+def test_the_read_command_prints_registers_in_the_given_order(run: Run, port: str) -> None:
     status, out, _ = run("read", port, TOY, 1, "output_current", "output_frequency")
     assert (status, out) == (0, "output_current    3.25  A\noutput_frequency  49.9  Hz\n")
 
 
-def test_read_prints_values_as_json(run: Run, port: str) -> None:
+def test_the_read_command_prints_values_as_json(run: Run, port: str) -> None:
     _, out, _ = run("read", port, TOY, 1, "output_current", "mystery", "fault", "status", "--json")
     assert json.loads(out) == {
         "drive": "toy@1",
@@ -109,7 +109,7 @@ def test_values_and_bits_without_names_are_shown_as_numbers(
     assert told["values"] == {name: {"value": value, "raw": raw}}
 
 
-def test_read_prints_the_other_registers_if_the_drive_refuses_one(run: Run, port: str) -> None:
+def test_the_read_command_prints_the_other_registers_if_the_drive_refuses_one(run: Run, port: str) -> None:
     status, out, err = run("read", port, TOY, 2, "status", "fault")
     assert (status, out) == (1, "status  none\nfault         refused: code 02H, illegal address\n")
     assert err == ""
@@ -147,7 +147,7 @@ def test_a_stop_needs_no_readable_state(run: Run, port: str, toy: SimulatedDrive
     assert set(writes) == {(0x14, 0)}
 
 
-def test_write_prints_its_outcome_on_one_line(run: Run, port: str, toy: SimulatedDrive) -> None:
+def test_the_write_command_prints_its_outcome_on_one_line(run: Run, port: str, toy: SimulatedDrive) -> None:
     toy["status"] = Status(0)
     assert run("write", port, TOY, 1, "acceleration_time", "12.5", "--yes") == (
         0,
@@ -170,7 +170,7 @@ def test_a_write_for_a_stopped_motor_fails_while_it_runs(run: Run, port: str, to
     assert toy["acceleration_time"] == 10.0
 
 
-def test_write_prints_its_outcome_as_json(run: Run, port: str) -> None:
+def test_the_write_command_prints_its_outcome_as_json(run: Run, port: str) -> None:
     _, out, _ = run("write", port, TOY, 1, "frequency", "25", "--json", "--yes")
     assert json.loads(out) == {
         "drive": "toy@1",
@@ -382,13 +382,13 @@ def test_the_command_wear_shows_the_eeprom_ledger(run: Run, port: str, toy: Simu
     assert run("wear")[1].splitlines()[2].split()[:4] == ["/dev/ttyS7", "2", "meter", "period"]
 
 
-def test_state_and_read_write_nothing_to_the_drive(run: Run, port: str, toy: SimulatedDrive) -> None:
+def test_the_commands_state_and_read_send_no_write(run: Run, port: str, toy: SimulatedDrive) -> None:
     run("state", port, TOY, 1)
     run("read", port, TOY, 1)
     assert not toy.counters.writes
 
 
-def test_state_is_printed_in_words_and_as_json(run: Run, port: str) -> None:
+def test_the_state_command_is_printed_in_words_and_as_json(run: Run, port: str) -> None:
     assert run("state", port, TOY, 1) == (0, f"running\n{DOG}\n", "")
     _, out, _ = run("state", port, TOY, 1, "--json")
     assert json.loads(out)["state"] == {"condition": "running", "direction": None, "fault": None, "note": ""}

@@ -41,7 +41,9 @@ def crowded(tmp_path: Path) -> Path:
     return path
 
 
-def test_plan_prints_the_rates_and_returns_0_if_the_line_can_reach_them(run: Run, fitting: Path) -> None:
+def test_the_plan_command_prints_the_rates_and_returns_0_if_the_line_can_reach_them(
+    run: Run, fitting: Path
+) -> None:
     status, out, err = run("plan", fitting)
     assert (status, err) == (0, "")
     lines = out.splitlines()
@@ -53,7 +55,7 @@ def test_plan_prints_the_rates_and_returns_0_if_the_line_can_reach_them(run: Run
     assert len(lines) == 5
 
 
-def test_plan_shortens_long_names_and_aligns_its_columns(run: Run, tmp_path: Path) -> None:
+def test_the_plan_command_shortens_long_names_and_aligns_its_columns(run: Run, tmp_path: Path) -> None:
     """Names may differ only at their ends, and Chinese characters are two columns wide."""
     path = tmp_path / "named.toml"
     names = [
@@ -74,7 +76,7 @@ def test_plan_shortens_long_names_and_aligns_its_columns(run: Run, tmp_path: Pat
     assert {columns_of(row) for row in (first, second, chinese)} == {columns_of(head)}
 
 
-def test_plan_prints_the_same_figures_as_json(run: Run, fitting: Path) -> None:
+def test_the_plan_command_prints_the_same_figures_as_json(run: Run, fitting: Path) -> None:
     status, out, _ = run("plan", fitting, "--json")
     line = json.loads(out)["lines"]["hall-1"]
     assert (status, line["fits"], line["misfits"], line["remedies"], line["warnings"]) == (
@@ -100,7 +102,9 @@ def test_plan_prints_the_same_figures_as_json(run: Run, fitting: Path) -> None:
 
 
 @pytest.mark.slow
-def test_plan_prints_suggestions_and_returns_1_if_the_line_is_too_slow(run: Run, crowded: Path) -> None:
+def test_the_plan_command_prints_suggestions_and_returns_1_if_the_line_is_too_slow(
+    run: Run, crowded: Path
+) -> None:
     status, out, err = run("plan", crowded)
     assert (status, err) == (1, "")
     assert max(map(len, out.splitlines())) <= 80
@@ -130,7 +134,9 @@ def test_a_drive_without_a_rate_gets_time_on_an_overloaded_line(run: Run, crowde
 
 
 @pytest.mark.parametrize("model", ["yd1000", "delixi-modbus"])
-def test_plan_warns_of_polling_each_reading_by_its_own_request(run: Run, tmp_path: Path, model: str) -> None:
+def test_the_plan_command_warns_of_polling_each_reading_by_its_own_request(
+    run: Run, tmp_path: Path, model: str
+) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(LINE.format("hall-1", 1) + DRIVE.format("p", model, 1) + DRIVE.format("q", model, 2))
     status, out, _ = run("plan", path)
@@ -143,7 +149,7 @@ def test_plan_warns_of_polling_each_reading_by_its_own_request(run: Run, tmp_pat
     assert "?" not in run("plan", path)[1]
 
 
-def test_plan_includes_the_time_to_switch_between_line_settings(run: Run, tmp_path: Path) -> None:
+def test_the_plan_command_includes_the_time_to_switch_between_line_settings(run: Run, tmp_path: Path) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(
         LINE.format("hall-1", 1) + DRIVE.format("p", "yd1000", 1) + 'poll = ["output_current"]\n'
@@ -161,7 +167,7 @@ def test_plan_includes_the_time_to_switch_between_line_settings(run: Run, tmp_pa
     )
 
 
-def test_plan_prints_long_names_within_80_columns(run: Run, tmp_path: Path) -> None:
+def test_the_plan_command_prints_long_names_within_80_columns(run: Run, tmp_path: Path) -> None:
     path = tmp_path / "plant.toml"
     name = "the pump behind the second door on the left of the hall with the blue floor"
     path.write_text(LINE.format(name, 1) + DRIVE.format(name, TOY, 1) + 'every = "1 ms"\n')
@@ -170,7 +176,7 @@ def test_plan_prints_long_names_within_80_columns(run: Run, tmp_path: Path) -> N
     assert max(map(len, out.splitlines())) <= 80
 
 
-def test_plan_prints_all_mistakes_in_a_plant_file_and_returns_2(run: Run, fitting: Path) -> None:
+def test_the_plan_command_prints_all_mistakes_in_a_plant_file_and_returns_2(run: Run, fitting: Path) -> None:
     text = fitting.read_text().replace("port =", "prot =").replace('"1 s"', '"soon"')
     fitting.write_text(text)
     status, out, err = run("plan", fitting)
@@ -182,7 +188,7 @@ def test_plan_prints_all_mistakes_in_a_plant_file_and_returns_2(run: Run, fittin
     ]
 
 
-def test_plan_returns_2_for_a_missing_file(run: Run, tmp_path: Path) -> None:
+def test_the_plan_command_returns_2_for_a_missing_file(run: Run, tmp_path: Path) -> None:
     path = tmp_path / "none.toml"
     sentence = f"multidrop: {path}: the plant file cannot be read: No such file or directory\n"
     assert run("plan", path) == (2, "", sentence)

@@ -66,7 +66,7 @@ def one_line(directory: Path, port: str, name: str = "one.toml") -> Path:
     return path
 
 
-def test_read_accepts_a_plant_file_and_a_drive_name(run: Run, port: str, tmp_path: Path) -> None:
+def test_the_read_command_accepts_a_plant_file_and_a_drive_name(run: Run, port: str, tmp_path: Path) -> None:
     plant = one_line(tmp_path, port)
     shown = "output_current    3.25  A\noutput_frequency  49.9  Hz\n"
     assert run("read", plant, "pump-1", *READINGS) == (0, shown, "")
@@ -125,7 +125,7 @@ def test_options_for_plant_files_are_refused_without_a_plant_file(run: Run) -> N
         assert run(*words, "--port=a=b") == (2, "", sentence)
 
 
-def test_read_reports_mistakes_in_a_plant_file_like_the_command_plan(run: Run, plant: Path) -> None:
+def test_the_read_command_reports_plant_file_errors_as_the_plan_command_does(run: Run, plant: Path) -> None:
     plant.write_text(
         plant.read_text().replace('"pump-1"', '"fan-1"').replace("address = 4", "address = 4000")
     )
@@ -135,7 +135,9 @@ def test_read_reports_mistakes_in_a_plant_file_like_the_command_plan(run: Run, p
     assert run("read", plant.with_name("none.toml"), "fan-1")[0] == 2
 
 
-def test_write_accepts_plant_file_and_drive_name(run: Run, plant: Path, at: str, toy: SimulatedDrive) -> None:
+def test_the_write_command_accepts_plant_file_and_drive_name(
+    run: Run, plant: Path, at: str, toy: SimulatedDrive
+) -> None:
     words = ("write", plant, "pump-1", at, "frequency")
     assert run(*words, "25", "--yes") == (0, "pump-1: frequency = 25.00 Hz: done (cannot be read back)\n", "")
     assert toy["frequency"] == 25
@@ -219,7 +221,7 @@ def test_an_interrupted_start_prints_the_stop_command_with_the_plant_file(
     assert run(*err.splitlines()[-1].split()[6:])[0] == 0
 
 
-def test_models_shows_the_family_of_a_drive_in_a_plant(run: Run, plant: Path) -> None:
+def test_the_models_command_shows_the_family_of_a_drive_in_a_plant(run: Run, plant: Path) -> None:
     assert run("models", plant, "che-1") == run("models", "invt-che")
     status, _, err = run("models", plant, "che-2")
     assert (status, err.startswith(f"multidrop: {plant} has no drive 'che-2'; did you mean che-1")) == (
@@ -383,7 +385,7 @@ def test_a_stop_of_a_plant_prints_json(run: Run, tmp_path: Path, port: str, toy:
         (["--all", "--line", "roof"], "--all and --line contradict each other: give one of them"),
     ],
 )
-def test_a_mistaken_stop_of_a_plant_is_reported_as_not_sent(
+def test_a_stop_command_with_wrong_arguments_is_reported_as_not_sent(
     run: Run, plant: Path, at: str, toy: SimulatedDrive, words: list[str], mistake: str
 ) -> None:
     status, _, err = run("stop", plant, at, *words)

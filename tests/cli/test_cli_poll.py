@@ -121,7 +121,7 @@ def test_poll_records_segments_and_continues_after_a_restart(run: Run, plant: Pa
     assert out.endswith(f" in segments of {tmp_path}/run.arrows\n")
 
 
-def test_a_recording_in_segments_must_be_named_by_a_segment(run: Run, tmp_path: Path) -> None:
+def test_the_commands_convert_and_report_ask_for_one_segment_file(run: Run, tmp_path: Path) -> None:
     for number in (1, 2):
         with open_writer(tmp_path / f"run.0000000{number}.arrows", METADATA) as writer:
             writer.write(counting(100, 0))
@@ -258,7 +258,7 @@ def test_poll_puts_prediction_and_measurement_side_by_side(run: Run, plant: Path
 
 
 @pytest.mark.slow
-def test_no_bus_cycle_is_measured_if_registers_are_polled_at_rates(run: Run, plant: Path) -> None:
+def test_no_bus_cycle_is_measured_if_a_drive_has_a_polling_period(run: Run, plant: Path) -> None:
     plant.write_text(plant.read_text().replace("address = 1\n", 'address = 1\nevery = "200 ms"\n'))
     found = json.loads(run("poll", plant, "--seconds", 0.5, "--json")[1])["lines"]["hall-1"]["comparison"]
     assert found["measured"]["cycle_ms"] is None

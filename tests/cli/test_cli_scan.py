@@ -364,14 +364,16 @@ def devices(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "dev"
 
 
-def test_ports_lists_ports_with_adapter_and_driver(devices: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_ports_command_prints_the_adapter_and_driver_of_a_port(
+    devices: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["ports"]) == 0
     assert capsys.readouterr().out == (
         f"{devices}/ttyUSB0\n  FTDI R (0403:6001); driver ftdi_sio\n  you may open it\n"
     )
 
 
-def test_ports_advises_to_plug_in_an_adapter_if_there_is_no_port(
+def test_the_ports_command_advises_to_plug_in_an_adapter_if_there_is_no_port(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(multidrop.cli.scan, "_linux_ports", lambda: iter(()))
@@ -381,7 +383,9 @@ def test_ports_advises_to_plug_in_an_adapter_if_there_is_no_port(
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="permissions of POSIX")
-def test_ports_names_the_group_that_may_open_a_port(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_ports_command_prints_the_group_that_may_open_a_port(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     import grp
     import pwd
 
@@ -396,7 +400,9 @@ def test_ports_names_the_group_that_may_open_a_port(tmp_path: Path, monkeypatch:
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="permissions of POSIX")
-def test_port_advice_works_without_a_user_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_permission_advice_is_given_to_a_user_without_a_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     port = tmp_path / "ttyUSB0"
     port.touch(mode=0o660)
     monkeypatch.setattr(os, "getuid", lambda: 4_123_456)

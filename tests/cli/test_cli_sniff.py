@@ -243,7 +243,9 @@ def delixi_plant(directory: Path) -> Path:
 
 
 @pytest.mark.parametrize("command", [["decode"], ["sniff", "--replay"]])
-def test_decode_prints_values_of_a_capture_with_units(run: Run, capture: Path, command: list[str]) -> None:
+def test_the_decode_command_prints_values_of_a_capture_with_units(
+    run: Run, capture: Path, command: list[str]
+) -> None:
     status, out, err = run(*command, capture, "--plant", delixi_plant(capture.parent))
     assert (status, err) == (0, "")
     assert [line.partition("  ")[2] for line in out.splitlines()[:4]] == [
@@ -255,7 +257,7 @@ def test_decode_prints_values_of_a_capture_with_units(run: Run, capture: Path, c
     assert out.splitlines()[4:] == ["2 exchanges, 1 request without a reply, 2 unknown bytes"]
 
 
-def test_decode_without_a_plant_file_prints_raw_registers(run: Run, capture: Path) -> None:
+def test_the_decode_command_without_a_plant_file_prints_raw_registers(run: Run, capture: Path) -> None:
     out = run("decode", capture)[1]
     assert "  address 1  reads holding_register_500 = 5000  " in out
     objects = [json.loads(line) for line in run("decode", capture, "--json")[1].splitlines()]
@@ -291,7 +293,7 @@ def told(run: Run, path: Path, frames: Iterable[tuple[bytes, Side]], *words: obj
     return [line.partition("  ")[2] or line for line in out.splitlines()]
 
 
-def test_decode_prints_requests_other_than_reads(run: Run, tmp_path: Path) -> None:
+def test_the_decode_command_prints_requests_other_than_reads(run: Run, tmp_path: Path) -> None:
     delixi = (4, 0x02, 1, 0, bytes(4))
     frames = [
         frame(False, 1, 0x03, 0, 0, b"\x13\x88"),
@@ -361,7 +363,7 @@ def test_a_capture_can_be_replayed_into_an_equal_capture(run: Run, capture: Path
     assert run("decode", again) == first
 
 
-def test_decode_prints_the_number_of_columns_and_rows(run: Run, capture: Path) -> None:
+def test_the_decode_command_prints_the_numbers_of_rows_and_exchanges(run: Run, capture: Path) -> None:
     out = capture.parent / "a.csv"
     assert run("decode", capture, "--out", out) == (0, f"2 rows in {out}: 2 exchanges, 2 unknown bytes\n", "")
     assert [row.value for row in recorded(out)] == [5000, 5000]
@@ -442,7 +444,9 @@ def test_a_lost_port_ends_sniffing_with_a_sentence(run: Run) -> None:
     assert err.splitlines()[-1].startswith(f"multidrop: {port}: the port was lost (")
 
 
-def test_decode_prints_times_of_day_in_utc(run: Run, capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_decode_command_prints_times_of_day_in_utc(
+    run: Run, capture: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     try:
         monkeypatch.setenv("TZ", "America/New_York")
         tzset()

@@ -157,7 +157,8 @@ def test_a_stop_continues_after_its_terminal_was_closed(run: Run, che: Che, verb
 
     received.loses = loses
     with closing_terminal(verb, *words) as terminal:
-        assert terminal.process.wait(PATIENCE) >= 0  # not ended by a signal; 1 if its output is closed
+        # A signal would give a negative status. The status is 1 if the terminal closed the command's output.
+        assert terminal.process.wait(PATIENCE) >= 0
     assert is_closed.is_set()
     assert len(received.writes) >= begun + 3
     assert received.starts == received.starts[:1]
@@ -243,7 +244,9 @@ def plant_of(port: object, folder: Path) -> Path:
 @pytest.mark.long
 @patient
 @pytest.mark.parametrize("keys", usually(b"sy", b"Sy"))
-def test_a_monitors_stop_outlives_its_terminal(run: Run, che: Che, tmp_path: Path, keys: bytes) -> None:
+def test_the_monitor_completes_a_stop_after_its_terminal_was_closed(
+    run: Run, che: Che, tmp_path: Path, keys: bytes
+) -> None:
     received, words = che
     assert run("start", *words, "--frequency", 20, "--yes")[0] == 0
     begun = len(received.writes)

@@ -336,7 +336,9 @@ def test_doctor_reports_the_other_framing(port: str, asked: str, spoken: str, ot
 
 
 @pytest.mark.parametrize("table_of", ["setting", "command"], ids=["readable", "unreadable"])
-def test_any_register_measures_a_family_without_readings(run: Run, tmp_path: Path, table_of: str) -> None:
+def test_a_family_without_readings_is_measured_with_another_register(
+    run: Run, tmp_path: Path, table_of: str
+) -> None:
     family = tmp_path / "relay.toml"
     family.write_text(
         '[family]\ntitle = "Relay board"\nmanual = "x"\ncounts_from = 0\n[default]\ntable = "coil"\n'

@@ -231,7 +231,7 @@ def test_bash_completes_words_with_the_generated_script(run: Run, tmp_path: Path
     assert dict(zip(TYPED, found, strict=True)) == TYPED
 
 
-def test_models_lists_the_families(run: Run) -> None:
+def test_the_models_command_lists_the_families(run: Run) -> None:
     status, out, _ = run("models")
     assert status == 0
     # leave out indented lines, which continue the title above them
@@ -244,7 +244,7 @@ def test_models_lists_the_families(run: Run) -> None:
     assert [family["model"] for family in json.loads(out)] == [*MODELS, *SHIPPED]
 
 
-def test_models_prints_every_fact_of_a_family(run: Run) -> None:
+def test_the_models_command_prints_every_fact_of_a_family(run: Run) -> None:
     _, out, _ = run("models", TOY)
     for line in (
         "addresses       1-31",
@@ -267,7 +267,7 @@ def test_models_prints_every_fact_of_a_family(run: Run) -> None:
         assert any(shown.startswith(line) for shown in out.splitlines()), f"{line!r} is not in\n{out}"
 
 
-def test_models_prints_every_register_of_a_family_as_json(run: Run) -> None:
+def test_the_models_command_prints_every_register_of_a_family_as_json(run: Run) -> None:
     _, out, _ = run("models", TOY, "--json")
     sheet = json.loads(out)
     by_name = {register["name"]: register for register in sheet["registers"]}
@@ -333,7 +333,9 @@ def test_models_prints_every_register_of_a_family_as_json(run: Run) -> None:
         ),
     ],
 )
-def test_models_prints_settings_and_limits_of_values(run: Run, name: str, facts: list[str]) -> None:
+def test_the_models_command_prints_settings_and_limits_of_values(
+    run: Run, name: str, facts: list[str]
+) -> None:
     """Settings and limits are printed in the words of the manual (ERMAN, section 3; YD1000, 4.3 and 6.1)."""
     _, out, _ = run("models", name)
     shown = " ".join(out.split())
@@ -341,7 +343,7 @@ def test_models_prints_settings_and_limits_of_values(run: Run, name: str, facts:
     assert "3.5 characters" not in shown or name in ("erman-er-g-220", "invt-che", "delixi-modbus")
 
 
-def test_models_prints_the_limits_of_values_as_json(run: Run) -> None:
+def test_the_models_command_prints_the_limits_of_values_as_json(run: Run) -> None:
     _, out, _ = run("models", "yd1000", "--json")
     sheet = json.loads(out)
     by_name = {register["name"]: register for register in sheet["registers"]}
@@ -366,7 +368,7 @@ def test_models_prints_the_limits_of_values_as_json(run: Run) -> None:
 
 
 @table("name", [*MODELS, *SHIPPED])
-def test_models_prints_each_family_within_80_columns(run: Run, name: str) -> None:
+def test_the_models_command_prints_each_family_within_80_columns(run: Run, name: str) -> None:
     _, out, _ = run("models", name)
     too_wide = [line for line in out.splitlines() if len(line) > 80]
     assert not too_wide
@@ -382,7 +384,7 @@ Where the document errs or is silent, the safest interpretation applies:
 - The example of function 06"""
 
 
-def test_models_keeps_the_indented_lines_of_notes(run: Run, tmp_path: Path) -> None:
+def test_the_models_command_keeps_indented_lines_of_notes(run: Run, tmp_path: Path) -> None:
     notes = "Two words:\n    0 off\n    1 on\n* one\n* two"
     docstring = f'"""Mine.\n\n{notes}"""'.replace("\n", "\n    ")
     (tmp_path / "mine.py").write_text(
@@ -392,13 +394,13 @@ def test_models_keeps_the_indented_lines_of_notes(run: Run, tmp_path: Path) -> N
     assert run("models", f"{tmp_path / 'mine.py'}:Mine")[1].endswith(f"Mine.\n\n{notes}\n")
 
 
-def test_models_wraps_notes_as_paragraphs(run: Run) -> None:
+def test_the_models_command_wraps_notes_as_paragraphs(run: Run) -> None:
     _, out, _ = run("models", "erman-er-g-220")
     assert NOTES in out
     assert "refuse others.\n\nNo ranges, defaults" in out
 
 
-def test_models_shows_addresses_that_do_not_wear_eeprom(run: Run, tmp_path: Path) -> None:
+def test_the_models_command_shows_addresses_that_do_not_wear_eeprom(run: Run, tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text(
         "from multidrop.families.invt_che import InvtCHE, parameter\n\n\n"
         'class Mine(InvtCHE):\n    """With a parameter."""\n\n'
@@ -409,7 +411,7 @@ def test_models_shows_addresses_that_do_not_wear_eeprom(run: Run, tmp_path: Path
     assert "        kept: EEPROM; written at 800BH, in RAM" in out
 
 
-def test_models_shows_which_writes_may_move_the_motor(run: Run, tmp_path: Path) -> None:
+def test_the_models_command_shows_which_writes_may_move_the_motor(run: Run, tmp_path: Path) -> None:
     (tmp_path / "moved.py").write_text(
         "from multidrop import Drive, command, setting\n\n\n"
         'class Moved(Drive):\n    """Moved."""\n\n'

@@ -121,7 +121,7 @@ def test_the_monitor_derives_a_drives_state_from_polled_registers(watched: LiveP
     assert [drive.so_far.misses.total() for drive in watched.drives] == [12, 0, 0]
 
 
-def test_a_skipped_poll_of_a_silent_drive_does_not_hide_the_reason_no_reply(watched: LivePlant) -> None:
+def test_a_skipped_poll_keeps_the_reason_why_a_drive_is_silent(watched: LivePlant) -> None:
     watched.add(from_rows([row("drive-3", name, None, "not asked: drive is silent", ago=0) for name in CHE]))
     assert watched.drives[2].why_silent == "no reply"
 
@@ -263,7 +263,7 @@ def test_monitor_pictures_fit_every_terminal_size(tmp_path: Path, size: tuple[in
 
 
 @pytest.mark.parametrize("name", ["pump", "a-drive-of-a-long-name", "主泵电机三号线北侧冷却水循环"])
-def test_the_narrowest_picture_shows_the_age_and_all_keys(tmp_path: Path, name: str) -> None:
+def test_the_narrowest_monitor_screen_shows_the_age_and_the_help_line(tmp_path: Path, name: str) -> None:
     live = LivePlant(a_plant(tmp_path, 1))
     live.drives[0].polled.drive.name = name
     size = LEAST_WIDTH, LEAST_HEIGHT
@@ -313,7 +313,7 @@ def test_the_page_of_a_drive_shows_every_register(watched: LivePlant) -> None:
     assert rows["device"].split()[1] == "..."
 
 
-def test_the_page_of_a_drive_shows_whole_reasons_if_values_are_short(watched: LivePlant) -> None:
+def test_the_page_of_a_drive_shows_full_reasons_for_missing_values(watched: LivePlant) -> None:
     why = "not asked: drive is silent"
     watched.add(from_rows([row("drive-1", name, None, why) for name in CHE]))
     lines = texts(page(watched.drives[0], {}, Position(page=True), (80, 24), after(0)))
@@ -421,7 +421,9 @@ def test_the_monitor_sends_a_stop_only_after_a_yes(screened: Screened) -> None:
         assert screened.poller.asked == asked
 
 
-def test_the_monitor_can_stop_without_a_thread(screened: Screened, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_monitor_sends_a_stop_even_if_no_thread_can_be_started(
+    screened: Screened, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monitor, poller = screened
 
     def none(thread: object) -> None:
@@ -542,7 +544,7 @@ def test_quitting_waits_for_a_running_stop(screened: Screened, capsys: pytest.Ca
         assert not monitor._has_left
     screened.press(("q", "y"))
     assert monitor._has_left
-    # the stop is done once rows are recorded during the wait
+    # While the monitor waits, it calls `hand_out` to record rows. Here this call also completes the stop.
     monitor._session = monitor._session._replace(hand_out=stands.set)
     assert monitor.await_stops() == []
     assert not any(thread.is_alive() for thread in monitor._stops)
@@ -555,7 +557,7 @@ def test_quitting_waits_for_a_running_stop(screened: Screened, capsys: pytest.Ca
     "keys", ["joksy", "\u043e\u0442\u043b\u044b\u043d", "\u043e\u0442\u043b\u0456\u043d"]
 )
 def test_keys_are_the_same_in_cyrillic_layouts(screened: Screened, keys: str) -> None:
-    screened.press(keys)  # the keys down, one without a function, up, stop, yes
+    screened.press(keys)  # down (j), a key without a function (o), up (k), stop (s), yes (y)
     assert screened.poller.asked == ["drive-1 control STOP"]
 
 

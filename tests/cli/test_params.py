@@ -69,7 +69,9 @@ def test_apply_writes_only_after_confirmation(run: Run, drive: tuple[object, ...
 
 
 @pytest.mark.long
-def test_a_refused_write_names_its_option(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_refused_write_is_reported_with_the_option_that_permits_it(
+    run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     # shorter, because with the manual's silences the test would take 2 s

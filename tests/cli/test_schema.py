@@ -55,7 +55,7 @@ def module(path: str) -> Any:
 
 
 PLANTS, FAMILIES = module("plant/test_plant.py"), module("families/files/test_loader.py")
-# users' own families that plant files of the tests name
+# families as users declare them; the plant files of the tests refer to them
 OWN = ("family.py:Toy", "family.py:Fixed", "family.py:Mute")
 
 
@@ -414,7 +414,7 @@ def test_schema_refuses_many_misspelt_names_of_registers(referring: str, is_acce
     assert accepts("family", csv)  # the CSV file may have registers with these names
 
 
-FIRST_SECTION = "[reading]\n"  # `names` starts this table already
+FIRST_SECTION = "[reading]\n"  # the header that starts the text in `names`; it must not occur twice
 
 
 def test_schema_refuses_csv_files_that_it_was_not_given(tmp_path: Path) -> None:

@@ -61,7 +61,7 @@ def instrument(module: types.ModuleType) -> None:
 
 def main() -> None:
     name, *arguments = sys.argv[1:]
-    decoding.ROWS = 2048  # fewer rows per batch than usual, but enough for a request of 2000
+    decoding.ROWS = 2048  # rows per batch: fewer than usual, but enough for a read of 2000 coils
     for package in PACKAGES.get(name, ()):
         for found in pkgutil.iter_modules(package.__path__, package.__name__ + "."):
             instrument(importlib.import_module(found.name))

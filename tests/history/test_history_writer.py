@@ -235,7 +235,7 @@ def test_closed_segments_are_compacted_and_old_files_removed(tmp_path: Path, wri
     until(lambda: {file.first for file in parquet_files(tmp_path / "tens")} == {4})
 
 
-def test_the_oldest_files_beyond_the_size_are_removed(
+def test_the_oldest_files_are_removed_if_the_history_is_too_large(
     tmp_path: Path, writers: Writers, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("rows", "tens", "damaged"):

@@ -100,7 +100,7 @@ SHORTER = (  # replacements that make long runs shorter
     (r"(?m)(multidrop poll plant.toml --out run.arrows)$", r"\1 --seconds 1"),
     (r'Bus\("(/dev/ttyUSB\d)"', r'Bus("\1", expiry=30'),  # a longer expiry of writes, for busy machines
 )
-NEEDED = {  # module that a block needs, by a text that occurs in the block
+NEEDED = {  # modules that a page's code block needs, by a text in the block
     "import polars\n": "polars",
     "import pandas\n": "pandas",
     "import duckdb\n": "duckdb",
@@ -136,7 +136,7 @@ def named(page: Path) -> str:
     return str(page.relative_to(ROOT))
 
 
-# Translations have the blocks of their English pages: see the last section.
+# Translated pages are not run: other tests check that their code blocks equal those of the English pages.
 RUN = [
     page
     for page in PAGES
@@ -291,7 +291,7 @@ def test_code_blocks_name_a_known_language() -> None:
     assert [each for each in found if each[2] not in LANGUAGES] == []
 
 
-def test_commands_listed_as_not_run_are_on_the_pages() -> None:
+def test_each_command_excluded_from_these_tests_is_in_the_documentation() -> None:
     text = "\n".join(block.text for page in PAGES for block in blocks(page))
     assert [begin for begin in NOT_RUN if begin not in text] == []
 

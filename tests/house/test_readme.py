@@ -169,7 +169,7 @@ def test_pump_example_stops_its_motor_when_the_program_ends(tmp_path: Path) -> N
 
 @pytest.mark.long
 def test_noise_hunt_example_finds_bad_checksums(tmp_path: Path) -> None:
-    # without patient.py, because its long timeouts would delay each lost reply
+    # patient.py, which other tests use, sets long timeouts: here each lost reply would wait for them
     printed = run(tmp_path, "noise_hunt.py", "5", through=())
     assert "pump-1: " in printed
     assert "bad checksum" in printed
@@ -199,7 +199,7 @@ def mounts(service: dict[str, Any]) -> dict[str, str]:
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", OURS)
-def test_container_commands_are_valid_and_read_only_mounted_files(
+def test_container_commands_are_valid_and_use_only_mounted_files(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     words: list[str] = OURS[name]["command"]
@@ -217,7 +217,7 @@ def test_container_commands_are_valid_and_read_only_mounted_files(
 
 @pytest.mark.long
 @pytest.mark.parametrize("file", FILES)
-def test_container_volumes_are_files_of_the_sources_or_declared(file: str) -> None:
+def test_each_container_volume_is_declared_or_is_a_file_of_the_project(file: str) -> None:
     found = FILES[file]
     sources = [source for service in found["services"].values() for source in mounts(service).values()]
     files = [source for source in sources if source.startswith(".")]
@@ -230,7 +230,7 @@ def test_container_volumes_are_files_of_the_sources_or_declared(file: str) -> No
 
 
 @pytest.mark.long
-def test_containers_open_matching_ports_on_this_computer_only() -> None:
+def test_containers_agree_on_ports_and_listen_on_localhost_only() -> None:
     services = FILES["compose.yaml"]["services"]
     page = PLANT["serve"]["listen"]
     (scraped,) = yaml.safe_load((FOLDER / "prometheus.yml").read_text())["scrape_configs"]
@@ -267,7 +267,9 @@ def test_each_container_has_no_rights_beyond_its_volumes(name: str) -> None:
     assert service["security_opt"] == ["no-new-privileges:true"]
 
 
-def test_the_plant_of_the_containers_can_be_served_and_simulated(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_plant_file_for_containers_is_valid_and_has_only_tcp_ports(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     assert main(["serve", "--check", str(FOLDER / "plant.toml")]) == 0
     assert "parts: history, mqtt" in capsys.readouterr().out
     assert {urlsplit(line["port"]).scheme for line in PLANT["line"]} == {"tcp"}

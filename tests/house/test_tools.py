@@ -174,7 +174,7 @@ OF_C = {
     "if (*at <= most)",
     "if (*at >= most)",
     "if (!(*at < most))",
-    ";",  # this line replaces each of the three statements in turn
+    ";",  # a mutant without a statement; there is one for each of three statements
     "return 1;",
     "return 0;",
     "return -0;",
@@ -303,7 +303,7 @@ def test_a_table_row_fails_if_skipped_or_if_an_expected_error_is_missing() -> No
 @table("left", [0, 1])
 @table("right", [0, 1])
 @pytest.mark.parametrize("sum_", [0, 1, 2])
-def test_test_tables_accept_nested_tables_and_fixtures(
+def test_the_table_decorator_can_be_nested_and_used_with_fixtures(
     left: int, right: int, sum_: int, tmp_path: object
 ) -> None:
     assert (left + right == sum_) is (sum_ - left == right)

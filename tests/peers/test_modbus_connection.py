@@ -24,7 +24,7 @@ BACKENDS = ("multidrop.modbus_connection", "modbus_connection.pymodbus", "modbus
 LATE_S, TIMEOUT_S = 0.6, 0.5
 READS, LATE_EVERY = 40, 4  # every fourth reply is late
 
-# takes a request from the unit id on, without checksum; returns a reply in the same form
+# a device's function from a request to its reply; both are unit id, function code and data, without a CRC
 Answer = Callable[[bytes], bytes]
 
 

@@ -141,7 +141,7 @@ def test_the_identity_of_a_server_can_be_read(server: Server) -> None:
 
 @pytest.mark.slow
 @patient
-def test_values_written_to_other_servers_are_read_back(server: Server) -> None:
+def test_a_value_written_to_a_foreign_modbus_server_is_read_back(server: Server) -> None:
     with Bus(server.port) as bus:
         device = server.attach(bus)
         for name, value in (("frequency", 28.5), ("energy", 1234567.89), ("relay", 0), ("relay", 1)):
@@ -159,9 +159,8 @@ def test_exception_code_raises_drive_exception(server: Server) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    "name", [name for name in COMMANDS if name != "libmodbus tcp"]
-)  # a server that answers requests to any unit id
+# libmodbus answers requests to any unit id over TCP
+@pytest.mark.parametrize("name", [name for name in COMMANDS if name != "libmodbus tcp"])
 def test_a_read_from_an_address_without_a_device_times_out(name: str, tmp_path: Path) -> None:
     advice = r"name the port socket://127\.0\.0\.1:\d+" if "tcp" in name else "does not answer"
     with running(name, tmp_path) as server, Bus(server.port) as bus:

@@ -66,7 +66,8 @@ def test_a_recording_is_read_back_with_the_written_rows(tmp_path: Path, suffix: 
     assert reader.truncated == 0
     assert rows(reader) == RECORDED
     assert rows(reader) == RECORDED  # a second iteration gives the same rows
-    assert [*chain.from_iterable(reader)] == RECORDED  # here no batch is kept while its rows are read
+    # no variable refers to a batch while its rows are read, so the batch must keep its memory alive itself
+    assert [*chain.from_iterable(reader)] == RECORDED
 
 
 @every_format
@@ -181,7 +182,7 @@ def test_a_name_that_ends_within_a_character_is_reported_as_damage(tmp_path: Pat
     content, whole, cut = path.read_bytes(), struct.pack("<3i", 0, 3, 4), struct.pack("<3i", 0, 2, 4)
     assert content.count(whole) == 1
     path.write_bytes(content.replace(whole, cut))
-    with pytest.raises(ValueError, match="is damaged after row 0: its text is not UTF-8"):
+    with pytest.raises(ValueError, match="is damaged after row 0: a text is not UTF-8"):
         list(open_recording(path))
 
 
@@ -347,7 +348,7 @@ def test_a_recording_is_not_converted_into_itself(tmp_path: Path) -> None:
     assert rows(open_recording(path)) == RECORDED
 
 
-def test_a_conversion_of_another_file_leaves_the_target_unchanged(tmp_path: Path) -> None:
+def test_a_failed_conversion_leaves_the_target_unchanged(tmp_path: Path) -> None:
     target = record(tmp_path / "b.arrows")
     (tmp_path / "a.csv").write_text("time,value\n")
     with pytest.raises(ValueError, match=r"a\.csv is not a recording"):

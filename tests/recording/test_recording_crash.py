@@ -118,7 +118,9 @@ def test_a_recording_appended_to_another_is_refused(tmp_path: Path) -> None:
         recorded(first)
 
 
-def test_names_beyond_memory_are_reported_as_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_names_that_exceed_the_memory_limit_are_reported_as_damage(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The limit and the data are both smaller than in practice, by a factor of 256."""
     monkeypatch.setattr(arrow_decoder, "MOST_SPELLED", arrow_decoder.MOST_SPELLED // 256)
     path = tmp_path / "a.arrows"

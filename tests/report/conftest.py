@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @pytest.fixture(scope="module")
 def ramp(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Record a pump whose speed rises for 100 s. From 30 Hz on, every second `fault` is a miss."""
+    """Record a pump whose speed rises for 100 s. From 30 Hz on, every second value of `fault` is missed."""
     rows = []
     for tick in range(1000):
         second, hz = tick / 10, tick / 20

@@ -149,29 +149,29 @@ def test_reply_that_may_answer_a_lost_request_has_no_response_delay(tmp_path: Pa
     assert pump.seconds * 1e3 == pytest.approx([10.0] * 10 + [30.0])
 
 
-def test_misses_that_grow_with_the_motors_speed_are_found(look: Recording) -> None:
+def test_missed_values_that_increase_with_motor_speed_are_found(look: Recording) -> None:
     shares = miss_shares(look, "pump")
     assert shares is not None
     slow = shares[1][shares[0] < 28]
     fast = shares[1][shares[0] > 32]
     assert slow.max() == 0
-    # half of the rows of `fault`, which is one of two registers
+    # half of the values of `fault` are missed, and none of the other register: a quarter of all values
     assert fast == pytest.approx(np.full(len(fast), 0.25), abs=0.02)
     assert miss_shares(look, "fan") is None
 
 
-def test_misses_by_output_frequency_need_a_varying_frequency(tmp_path: Path) -> None:
+def test_missed_values_are_not_sorted_by_a_constant_output_frequency(tmp_path: Path) -> None:
     rows = [row(at, "pump", "output_frequency", 50.0) for at in range(50)]
     rows.append(row(50, "pump", "output_frequency", None, "bad checksum"))
     assert miss_shares(load(record(tmp_path / "it.arrows", rows)), "pump") is None
 
 
-def test_misses_are_listed_by_reason(look: Recording) -> None:
+def test_missed_values_are_counted_by_reason(look: Recording) -> None:
     assert reasons_of(look, "pump") == {"bad checksum": 200}
     assert reasons_of(look, "fan") == {"no reply": 1}
 
 
-def test_reasons_for_misses_beyond_the_limit_are_combined(tmp_path: Path) -> None:
+def test_rare_reasons_for_missed_values_are_drawn_as_other_reasons(tmp_path: Path) -> None:
     rows = [row(at, "pump", "output_frequency", None, f"reason {at % 8}") for at in range(80)]
     rows += [row(at, "pump", "output_frequency", None, "no reply") for at in range(80)]
     (_, misses) = draw_rates(load(record(tmp_path / "it.arrows", rows))).axes
@@ -184,8 +184,8 @@ def test_reasons_for_misses_beyond_the_limit_are_combined(tmp_path: Path) -> Non
 def test_a_recording_gives_the_utilisation(planned: dict[str, Any], turns: list[Row], tmp_path: Path) -> None:
     look = load(record(tmp_path / "it.arrows", turns, ABOUT | {"planned": planned}))
     (line,) = line_uses(look)
-    # Pump: 14 ms to the reply's first character, then 8 ms; fan: 13 and 6 ms. The longer of two silences
-    # follows.
+    # An exchange with the pump takes 14 ms up to the reply's first character, and 8 ms for the others.
+    # One with the fan takes 13 ms and 6 ms. A silence follows: 10 ms before or after the fan, otherwise 4 ms.
     assert line.needed[1:99] == pytest.approx(np.array([0.029, 0.032] * 49))
     assert line.needed[101:] == pytest.approx(np.full(49, 0.026))
     assert line.utilisation == pytest.approx((50 * 0.029 + 50 * 0.032 + 50 * 0.026) / 9.976, rel=0.01)

@@ -157,7 +157,7 @@ def test_invalid_parts_of_metadata_are_left_out_of_a_report(
     rows = turns[:30]
     for number, metadata in enumerate(with_odd(about, odd)):
         if not isinstance(metadata, dict):
-            continue  # recordings refuse this copy as metadata
+            continue  # a recording's metadata must be a dict
         look = load(record(tmp_path / f"{number}.arrows", rows, metadata, pieces=1))
         assert all(
             np.isfinite([each.utilisation, each.rate("pump"), each.cycle or 0]).all()

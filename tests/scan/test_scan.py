@@ -528,7 +528,7 @@ class Bare(SimulatedIBD):
 
 
 @pytest.mark.slow
-def test_innovert_ibd_without_line_registers_is_reported_with_a_doubt() -> None:
+def test_an_innovert_ibd_with_unreadable_line_settings_is_reported_as_uncertain() -> None:
     bare = InnovertIBD(3), InnovertIBD(4, framing="ascii")
     line = Line(Pair([Bare(each) for each in bare]))
     plan = sweeps(FAMILIES, baudrates=[9600], formats=["8N1", "8E1"])

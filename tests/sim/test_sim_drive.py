@@ -269,7 +269,7 @@ def test_encoded_drive_confirms_writes_and_keeps_its_values() -> None:
     assert ask(sim, 3, 0x10, 1) == before
 
 
-def test_adjacent_encoded_drives_and_registers_have_different_numbers() -> None:
+def test_each_register_of_each_encoded_drive_has_a_different_number() -> None:
     tables = (HOLDING, INPUT, Table("another", 7, None))
     codes = {encoded(address, table, at) for address in range(1, 9) for table in tables for at in range(8)}
     assert len(codes) == 8 * 3 * 8

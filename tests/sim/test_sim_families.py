@@ -1,7 +1,7 @@
 """The simulated drive of every family replies to whole frames as its document says.
 
-A frame whose checksum is written out is printed in the family's document. A frame marked "composed" is made
-from the document's tables. checksums.py computes the checksums of all other frames.
+A frame whose checksum is written out is printed in the family's manual, unless its comment says that it was
+written by hand. checksums.py computes the checksums of all other frames.
 """
 
 from __future__ import annotations
@@ -143,7 +143,7 @@ def test_simulated_erman_ramps_the_motor_at_start_and_stop(erman: Bench) -> None
     erman.wait(60)
     assert erman.read(4, 0x400, 2) == [0, 1]
     assert erman.read(4, 0x01) == [285]
-    erman.exchange("01 05 00 01 FF 00 DD FA")  # stop; composed from the tables
+    erman.exchange("01 05 00 01 FF 00 DD FA")  # stop; written by hand from the manual's tables
     erman.wait(0.1)
     assert erman.read(4, 0x400, 2) == [0, 3]
     erman.wait(60)
@@ -163,13 +163,13 @@ def test_simulated_erman_ignores_a_start_while_the_stop_coil_is_on(erman: Bench)
 
 def test_simulated_erman_emergency_stop_prevents_a_start_until_a_reset(erman: Bench) -> None:
     erman.exchange("01 05 00 00 FF 00 8C 3A")
-    erman.exchange("01 05 00 02 FF 00 2D FA")  # emergency stop; composed from the tables
+    erman.exchange("01 05 00 02 FF 00 2D FA")  # emergency stop; written by hand from the manual's tables
     assert not erman.motor.energised
     assert erman.read(4, 0x402, 2) == [0, 1]
     erman.send(checksums.rtu("01 05 00 02 00 00"))
     erman.exchange("01 05 00 00 FF 00 8C 3A")
     assert not erman.motor.energised
-    erman.exchange("01 05 00 09 FF 00 5C 38")  # reset; composed from the tables
+    erman.exchange("01 05 00 09 FF 00 5C 38")  # reset; written by hand from the manual's tables
     assert not erman.motor.energised
     assert erman.read(4, 0x402, 2) == [0, 1]
     erman.exchange("01 05 00 00 FF 00 8C 3A")
@@ -193,7 +193,7 @@ def test_simulated_invt_che_device_code_register_reads_0101h(che: Bench) -> None
 
 def test_simulated_invt_che_stores_a_written_parameter() -> None:
     che = Bench(MyCHE(2))
-    frame = "02 06 00 08 13 88 05 6D"  # the example of section 11.6.2
+    frame = "02 06 00 08 13 88 05 6D"  # example in section 11.6.2 of the CHE manual
     assert che.exchange(frame) == frame
     assert che.sim["jump"] == 0x1388
 
@@ -302,7 +302,7 @@ def test_simulated_innovert_ibd_outputs_show_the_motors_state(ibd: Bench) -> Non
 
 def test_direction_bits_alone_reverse_a_running_simulated_innovert_ibd(ibd: Bench) -> None:
     assert ibd.write(0x2001, 2000) == 0
-    # reverse; forward; reverse, which both bits together mean
+    # bits for reverse, for forward, and both bits together, which mean reverse
     for bits, direction in ((0x06, -1), (0x08, 1), (0x0C, -1)):
         assert ibd.write(0x2000, bits) == 0
         assert ibd.motor.direction == direction
@@ -336,7 +336,7 @@ def test_trip_ends_a_jog_of_a_simulated_innovert_ibd(ibd: Bench) -> None:
     assert ibd.motor.frequency == 50
 
 
-def test_simulated_innovert_ibd_obeys_the_line_only_if_set_to_it(ibd: Bench) -> None:
+def test_simulated_innovert_ibd_obeys_the_line_only_if_its_parameters_select_it(ibd: Bench) -> None:
     ibd.write(0x2001, 5000)
     ibd.write(102, 0)  # Prb.02
     assert ibd.write(0x2000, 2) == 0
@@ -381,14 +381,14 @@ def test_simulated_innovert_ibd_carries_out_a_broadcast_without_a_reply(ibd: Ben
     ibd.exchange("01 06 20 01 13 88 DE 9C")
     ibd.exchange("01 06 20 00 00 02 03 CB")
     ibd.wait(60)
-    assert ibd.exchange("00 06 20 00 00 01 42 1B") == ""  # stop; composed from the tables
+    assert ibd.exchange("00 06 20 00 00 01 42 1B") == ""  # stop; written by hand from the manual's tables
     ibd.wait(60)
     assert not ibd.motor.energised
 
 
 def test_delixis_forward_command_resets_a_fault_of_a_simulated_innovert_ibd(ibd: Bench) -> None:
     ibd.sim.trip(1)
-    ibd.exchange("01 06 20 00 00 10 83 C6")  # composed from the tables
+    ibd.exchange("01 06 20 00 00 10 83 C6")  # written by hand from the manual's tables
     assert (ibd.motor.fault, ibd.motor.energised) == (0, False)
 
 
@@ -427,7 +427,7 @@ def test_simulated_delixi_obeys_the_line_only_if_its_parameters_select_it(delixi
 
 def test_simulated_delixi_reverse_command_turns_the_motor_in_reverse(delixi: Bench) -> None:
     delixi.exchange("01 06 00 02 13 88 25 5C")
-    delixi.exchange("01 06 20 00 00 22 02 13")  # composed from the tables
+    delixi.exchange("01 06 20 00 00 22 02 13")  # written by hand from the manual's tables
     delixi.wait(60)
     assert delixi.motor.frequency == -50
 
@@ -452,13 +452,14 @@ def native() -> Bench:
 
 
 def test_simulated_delixi_native_frequency_and_run_state_are_read(native: Bench) -> None:
-    assert native.exchange(":010300000000000004")[:9] == ":01030001"  # composed from the tables; stopped
+    # written by hand from the manual's tables; state 1: stopped
+    assert native.exchange(":010300000000000004")[:9] == ":01030001"
     native.exchange(":0104000100001388A1")
     native.exchange(":010200020000000005")
     native.wait(60)
     assert native.exchange(":010701F400000000FD") == ":010701F40000138898"
     assert native.exchange(":010300000000000004")[:9] == ":01030002"
-    native.exchange(":010200030000000006")  # reverse; composed from the tables
+    native.exchange(":010200030000000006")  # reverse; written by hand from the manual's tables
     native.wait(60)
     assert native.exchange(":010300000000000004")[:9] == ":01030003"
 
@@ -546,7 +547,7 @@ def test_simulated_delixi_native_carries_out_a_broadcast_without_a_reply(native:
     native.exchange(":0104000100001388A1")
     native.exchange(":010200020000000005")
     native.wait(60)
-    assert native.exchange(":000200010000000003") == ""  # stop; composed from the tables
+    assert native.exchange(":000200010000000003") == ""  # stop; written by hand from the manual's tables
     native.wait(60)
     assert not native.motor.energised
 
@@ -685,12 +686,12 @@ def test_preset_speed_bits_of_a_simulated_yd1000_select_the_speed(yd: Bench, bit
 @pytest.mark.parametrize(
     ("address", "value"),
     [
-        (0x0012, 8001),  # UL, the upper frequency limit: 0.5 Hz to FH
+        (0x0012, 8001),  # UL, the upper frequency limit: 0.5 Hz to FH, the maximum frequency
         (0x0012, 49),
         (0x0013, 8001),  # LL, the lower frequency limit: 0 Hz to UL
         (0x0018, 8001),  # Sr1, preset speed 1: LL to UL
         (0x0100, 8001),  # F100, the low-speed frequency: 0 Hz to FH
-        (0x1001, 8001),  # the setpoint: 0 Hz to FH
+        (0x1001, 8001),  # the setpoint: 0 Hz to FH, the maximum frequency
         (0x1002, 8001),
         (0x0802, 64),
         (0x0803, 101),
@@ -758,7 +759,9 @@ def test_simulated_yd1000_watchdog_trips_if_the_line_is_silent_too_long(yd: Benc
     assert yd.motor.fault
 
 
-CONFIRMED = {  # Frames to which the reply is a copy. Those of InvtCHE and YD1000 are composed.
+# Write requests, which a drive confirms with a copy. The manuals do not print those of InvtCHE and YD1000,
+# which were written by hand from the manuals' tables.
+CONFIRMED = {
     "erman": (
         lambda: ErmanERG220(1),
         "01 05 00 00 FF 00 8C 3A",  # start

@@ -28,7 +28,7 @@ from multidrop.transport.prepared import make_exchange
 READ = checksums.rtu("01 03 00 02 00 01")
 REPLY = checksums.rtu("01 03 02 00 00")
 START = checksums.rtu("01 06 10 00 C4 00")  # start command of a YD1000
-WHOLE = 5.0  # s after which every delayed byte has arrived
+WHOLE = 5.0  # seconds after which every delayed byte has arrived
 
 
 class LineClient:
@@ -78,17 +78,17 @@ def test_damaged_frame_has_exactly_one_simulated_fault(fault: str, length: int) 
     assert line.wire.struck[fault] >= len(damaged) + found.count(b"")
 
 
-def test_fault_twice_delivers_the_reply_twice() -> None:
+def test_a_simulated_line_can_send_a_reply_twice() -> None:
     assert LineClient(twice=1).bytes_after() == 2 * REPLY
 
 
-def test_fault_delay_delays_the_reply_by_up_to_late_seconds() -> None:
+def test_a_simulated_line_can_delay_a_reply() -> None:
     usual = LineClient().after()[0][0]
     delays = [LineClient(delay=1, late=0.5, seed=seed).after()[0][0] - usual for seed in range(50)]
     assert 0 <= min(delays) < 0.1 < 0.4 < max(delays) <= 0.5
 
 
-def test_fault_merge_sends_a_reply_together_with_the_next_one() -> None:
+def test_a_simulated_line_can_send_two_replies_together() -> None:
     line = LineClient(SimulatedDrive(Toy(1)), SimulatedDrive(Toy(2)), merge=1, late=4.0)
     line.wire.receive(READ, 0.0)
     assert timeline(line.wire, 0.3) == []
@@ -98,14 +98,14 @@ def test_fault_merge_sends_a_reply_together_with_the_next_one() -> None:
     assert received[-1][0] < 0.5
 
 
-def test_fault_merge_sends_a_delayed_reply_after_late_seconds() -> None:
+def test_a_delayed_reply_is_sent_alone_if_no_other_reply_follows() -> None:
     line = LineClient(merge=1, late=0.2)
     received = line.after()
     assert b"".join(piece for _, piece in received) == REPLY
     assert received[-1][0] < 0.4
 
 
-def test_fault_split_puts_a_pause_inside_the_reply() -> None:
+def test_a_simulated_line_can_pause_inside_a_reply() -> None:
     pauses = []
     for seed in range(50):
         times, pieces = zip(*LineClient(split=1, pause=0.5, seed=seed).after(), strict=True)
@@ -114,11 +114,11 @@ def test_fault_split_puts_a_pause_inside_the_reply() -> None:
     assert max(pauses) > 0.4
 
 
-def test_fault_echo_returns_the_request_before_the_reply() -> None:
+def test_a_simulated_line_can_echo_a_request() -> None:
     assert LineClient(echo=1).bytes_after() == READ + REPLY
 
 
-def test_fault_noise_adds_bytes_before_the_reply() -> None:
+def test_a_simulated_line_can_send_noise_before_a_reply() -> None:
     lengths = set()
     line = LineClient(noise=1, burst=9)
     for _ in range(100):
@@ -128,7 +128,7 @@ def test_fault_noise_adds_bytes_before_the_reply() -> None:
     assert lengths == set(range(1, 10))
 
 
-def test_fault_start_noise_occurs_only_when_a_motor_starts() -> None:
+def test_a_simulated_line_can_send_noise_when_a_motor_starts() -> None:
     line = LineClient(simulated(YD1000(1)), start_noise=1)
     stop = checksums.rtu("01 06 10 00 C0 00")
     assert line.bytes_after(stop) == stop
@@ -163,14 +163,14 @@ def test_simulated_faults_of_one_drive_affect_only_its_replies(fault: str) -> No
     assert line.wire.struck == {fault: 1}
 
 
-def test_fault_silence_stops_a_drives_replies_for_its_duration() -> None:
+def test_a_simulated_drive_can_be_silent_for_a_set_time() -> None:
     line = two_drives(silence=30.0, silent_for=9.0, first=10.0)
     replies = [line.bytes_after(FLAKY_READ) == FLAKY_REPLY for _ in range(10)]  # one request every 5 s
     assert replies == [True, True, False, False, True, True, True, True, False, False]
     assert line.bytes_after() == REPLY
 
 
-def test_fault_trip_trips_a_running_motor_and_fault_drift_changes_its_load() -> None:
+def test_simulated_faults_can_trip_a_motor_and_change_its_load() -> None:
     sim = simulated(YD1000(1, name="flaky"))
     assert isinstance(sim, MotorDrive)
     line = LineClient(sim, drives={"flaky": DriveFaults(trip=20.0, first=10.0, drift=0.2)})
@@ -192,7 +192,7 @@ def test_overload_fault_code_of_every_family_is_valid(model: type[Drive]) -> Non
     assert 0 < overload_code(drive) < 0x10000
 
 
-def test_fault_trip_is_refused_for_a_drive_without_a_motor() -> None:
+def test_a_simulated_trip_is_refused_for_a_drive_without_a_motor() -> None:
     with pytest.raises(
         ValueError, match="flaky has no simulated motor, so it takes no trip and no drift: remove them"
     ):

@@ -127,16 +127,16 @@ _PACKETS = {  # for each side of the line: dissector, sender, receiver, packet o
 }
 
 
-def _wrappings(frames: bytes, texts: bytes) -> Wrappings:
+def _wrappings(binary: bytes, text: bytes) -> Wrappings:
     """Return the headers and options of a line's packets.
 
-    `texts` is Wireshark's dissector for frames that start with ':', as ASCII frames do; `frames` is that for
-    all other frames.
+    Wireshark shows ASCII frames, which start with ':', with the dissector `text`. It shows all other frames
+    with the dissector `binary`.
     """
     return Wrappings(
         {
             (side, is_text): (
-                _head((texts if is_text else frames) if dissector == _RTU else dissector, sender, target),
+                _head((text if is_text else binary) if dissector == _RTU else dissector, sender, target),
                 _options(*options),
             )
             for side, (dissector, sender, target, options) in _PACKETS.items()

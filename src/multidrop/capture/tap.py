@@ -74,7 +74,7 @@ class Tapped:
         self.close()
 
 
-AFTER_S = 2.0  # a file ends this many seconds after its anomaly
+AFTER_S = 2.0  # seconds of traffic that a file records after an anomaly
 PAUSE_S = 60.0  # minimum time in s between two files, so that a noisy line does not fill the disk
 _NAME = re.compile(r"flight-\d{8}T\d{6}Z\.pcapng")
 _MOST_NAMED = 20  # largest number of anomalies in a file's comment

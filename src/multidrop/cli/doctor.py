@@ -214,7 +214,7 @@ def _findings(target: _Target) -> Iterator[Finding]:
     block = first_block(target.drives[0]) if target.drives else None
     if block:
         yield other_way_finding(port, block.request, settings)
-    # if the user named no drive, a missing answer in the other framing does not exclude it
+    # No drive is named. Of the possible far ends, only a Modbus TCP gateway would answer this request.
     elif not speaks_tcp(port):
         yield other_way_finding(port, nobody, settings)
 
@@ -373,8 +373,8 @@ def _is_from_gateway(drive: Drive, done: Completion) -> bool:
 def _repeat(line: Line, poll: Exchange) -> Iterator[Completion]:
     """Send up to ROUNDS requests within MOST_S; yield their outcomes.
 
-    While the reply to an earlier request may still come, the line holds a request back. Such a request does
-    not count. A drive that never answers gets only UNANSWERED requests.
+    The line does not send a request while a late reply to an earlier request may come. Only sent requests
+    count. If the drive does not reply at all, stop after `UNANSWERED` requests.
     """
     end = time.monotonic() + MOST_S
     count, is_silent = 0, True

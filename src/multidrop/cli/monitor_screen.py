@@ -18,7 +18,7 @@ from multidrop.printable import printable
 
 LEAST_WIDTH, LEAST_HEIGHT = 60, 12
 WIDE, WIDEST = 100, 110  # columns needed to show delays (WIDE), and also models (WIDEST)
-LEAST_DRIVES = 3  # minimum number of drives in the overview; curves of a trigger get only the room below
+LEAST_DRIVES = 3  # a trigger's curves are hidden if fewer drives than this would fit above them
 # notes beside a register's value, if it is old, or if the register is not polled
 OLD_NOTE, NOT_POLLED = "old", "not polled"
 NEVER = "never"

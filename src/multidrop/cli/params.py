@@ -116,7 +116,7 @@ def _diff(arguments: argparse.Namespace) -> int:
     else:
         one, words = _side(arguments, words)
         if isinstance(one, Target) and len(words) == 1 and not params.is_parameter_file(words[0]):
-            # the second side is one word: the name of a drive in the first side's plant file
+            # such as `params diff plant.toml pump-1 pump-2`: pump-2 is a drive of the same plant file
             words = [one.words[0], *words]
         other, words = _side(arguments, words)
         check_words(arguments, words, ())

@@ -249,7 +249,7 @@ _UP_AND_CLEAR = "\x1b[{}F\x1b[J"
 
 
 class LiveTable:
-    """A table with one line per drive: numbers of samples and misses so far, and newest values.
+    """A table with one line per drive: numbers of samples and missed values so far, and newest values.
 
     Each drawing replaces the previous one.
     """
@@ -377,7 +377,10 @@ class Keys:
     def of_terminal(
         cls, poller: Poller, table: LiveTable, how: Rotation | Triggering | None, out: Path | None
     ) -> Iterator[Keys | None]:
-        """Yield the keys of this terminal; None if its keys cannot be read, as in the background."""
+        """Yield a handler of key presses in this terminal.
+
+        Yield None if key presses cannot be read, for example because the process runs in the background.
+        """
         if not (keys_are_readable() and _is_in_foreground()):
             yield None
             return

@@ -136,7 +136,7 @@ def _beside(recording: Path, suffix: str) -> Path:
 def _load_recording(path: Path, out: Path, command: str) -> Recording:
     """Load a recording for a command that draws it into the new file `out`.
 
-    Raises ValueError if `out` exists, or if `path` is a folder or names segments.
+    Raises ValueError if `out` exists, if `path` is a folder, or if the recording is split into segment files.
     """
     require_extra("matplotlib", "plot", command)
     refuse_overwriting(out)

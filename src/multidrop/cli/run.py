@@ -112,7 +112,10 @@ def _unseen_faults(test: TestRun) -> dict[str, str]:
 
 @contextmanager
 def _screen(test: TestRun, arguments: argparse.Namespace) -> Iterator[list[Callable[[Rows], object]]]:
-    """Yield the function of a live table that takes polled rows; none without a terminal or with --json."""
+    """Yield a list with the function that shows polled rows in a live table.
+
+    Without a terminal or with --json, the list is empty.
+    """
     if arguments.json or not sys.stdout.isatty():
         yield []
         return
@@ -123,7 +126,7 @@ def _screen(test: TestRun, arguments: argparse.Namespace) -> Iterator[list[Calla
         def show(rows: Rows) -> None:
             nonlocal is_ending
             table.add(rows)
-            # print the first table after a signal below the signal's message, not over it
+            # Ctrl-C printed a message: draw the next table below it, not over it.
             if not is_ending and signal_has_come():
                 is_ending = True
                 table.keep_drawing(time.monotonic())

@@ -32,8 +32,8 @@ def run(arguments: argparse.Namespace) -> int:
 def schema_of(kind: str, names: Sequence[str] = (), folder: Path | None = None) -> dict[str, Any]:
     """Return the JSON Schema of a "plant" or "family" file in `folder`.
 
-    `names` are a user's own families, written as a plant file would name them, or the CSV files that a family
-    file may name. Raises ValueError if one of these cannot be used.
+    For "plant", `names` are a user's own families, such as "meter.toml" or "fan.py:Fan". For "family", they
+    are the CSV files that the family file may name. Raises ValueError if one of these cannot be used.
     """
     if kind == "family":
         from multidrop.families.files.registers import beside

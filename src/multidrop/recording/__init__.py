@@ -13,7 +13,7 @@ written first; if it is incomplete, the file cannot be read.
 `convert` also exports recordings, for other systems: `.mf4` (ASAM MDF 4.10, needs asammdf) and `.h5` (HDF5,
 needs h5py).
 
-The recordings of all three formats have the same columns, and one row for every sample or miss:
+The recordings of all three formats have the same columns, and one row for every sample or missed value:
 
 | column           | type               | meaning                                                    |
 |------------------|--------------------|------------------------------------------------------------|
@@ -23,7 +23,7 @@ The recordings of all three formats have the same columns, and one row for every
 | `drive`          | utf8               | the drive's name                                           |
 | `register`       | utf8               | the register's name                                        |
 | `value`          | float64, or null   | in the register's unit                                     |
-| `status`         | utf8               | `ok`, or the reason for a miss: the two others are null    |
+| `status`         | utf8               | `ok`, or why there is no value and no uncertainty          |
 
 A spreadsheet would evaluate a text as a formula if it starts with `=`, `+`, `-`, `@`, a tab or a line end. In
 .csv, such a text gets an apostrophe in front. So does a text that starts with apostrophes followed by one of
@@ -75,8 +75,8 @@ def open_writer(
 ) -> RecordingWriter:
     """Create a recording, and return its writer. With `overwrite`, replace an existing recording at `path`.
 
-    Raises FileExistsError if there is a file at `path`, ValueError for another suffix, TypeError for
-    metadata that JSON cannot hold, and RecordingError if the file cannot be written.
+    Raises FileExistsError if there is a file at `path`, ValueError if the suffix is not .arrows, .csv or
+    .parquet, TypeError for metadata that JSON cannot hold, and RecordingError if the file cannot be written.
     """
     if not isinstance(metadata, Mapping):
         raise TypeError(f"open_writer takes metadata as a dict, such as plant.metadata(), not {metadata!r}")

@@ -140,9 +140,8 @@ class RecordedColumns(NamedTuple):
     register: memoryview
     value: memoryview  # undefined if the row has no value
     status: memoryview
-    # one bit per row: 1 if the row has an uncertainty, or a value; None: every row has one
-    certain: bytes | None
-    valid: bytes | None
+    certain: bytes | None  # one bit per row, 1 if the row has an uncertainty; None: all rows have one
+    valid: bytes | None  # one bit per row, 1 if the row has a value; None: all rows have one
     drives: tuple[str, ...]
     registers: tuple[str, ...]
     statuses: tuple[str, ...]
@@ -293,4 +292,4 @@ def _check_text(offsets: bytes, text: bytes) -> None:
         return
     for at in memoryview(offsets)[: len(offsets) // 4 * 4].cast("i"):
         if 0 <= at < len(text) and text[at] & 0xC0 == 0x80:  # the text starts in the middle of a character
-            raise ValueError("its text is not UTF-8")
+            raise ValueError("a text is not UTF-8")

@@ -158,7 +158,7 @@ def _bitmap(bits: memoryview | None, begin: int, end: int) -> bytes:
 
 
 class _BatchCodes:
-    """The codes of a polled batch. The C core has already numbered its drives and registers."""
+    """A polled batch with numbers instead of names. The C core numbers drives and registers."""
 
     def __init__(self, batch: Batch, statuses: CodeTable) -> None:
         columns = self._columns = batch.columns()
@@ -185,7 +185,7 @@ class _BatchCodes:
 
 
 class _RowCodes:
-    """The codes of rows whose names are text, such as rows read from another recording."""
+    """Rows with numbers instead of names, made from rows with names, such as rows of another recording."""
 
     def __init__(self, rows: Rows, known: dict[int, dict[str, int]]) -> None:
         children = list(rows.arrow().view().children)

@@ -181,7 +181,7 @@ class ArrowsTail:
                 return
             body = self._body(message)
             try:
-                # a dictionary counts as read only with its batch, because a failed write removes both
+                # `_end` moves only past a whole batch: a failed write removes the batch and its dictionaries
                 if message.kind != RECORD_BATCH:
                     self._decoder.decode(message, message.header, body)
                     continue

@@ -1,4 +1,4 @@
-"""Recordings as text (.csv), one line per sample or miss, with the metadata in a second file (.csv.json)."""
+"""Recordings as text (.csv), one line per row, with the metadata in a second file (.csv.json)."""
 
 from __future__ import annotations
 

@@ -97,7 +97,7 @@ class AppendingWriter(RecordingWriter):
 
 
 _REASONS = {  # by exception of a library: what is wrong with the file
-    UnicodeDecodeError: "its text is not UTF-8",
+    UnicodeDecodeError: "a text is not UTF-8",
     struct.error: "the stated lengths do not match the data",
     RuntimeError: "the stated lengths do not match the data",  # from nanoarrow
 }
@@ -106,8 +106,8 @@ _REASONS = {  # by exception of a library: what is wrong with the file
 class RecordingReader(ArrowTable):
     """Reads the rows that a recording had when it was opened. Each iteration starts at the first row.
 
-    Tables of pandas or polars and the wide form hold all rows in memory. Arrow libraries accept the
-    reader itself: `pyarrow.table(reader)`.
+    Tables of pandas or polars and the table of `wide()` hold all rows in memory. Arrow libraries accept
+    the reader itself: `pyarrow.table(reader)`.
 
     `truncated` is the number of skipped bytes at the end of the file: an incomplete batch, left by a killed
     writer or a full disk.

@@ -20,7 +20,7 @@ from multidrop.recording.arrows import ArrowsReader, ArrowsWriter
 from multidrop.recording.format import Metadata, RecordingWriter, writing
 from multidrop.transport import clock
 
-MOST_CUT = 1 << 24  # limit in bytes of an unreadable end that is removed from a file
+MOST_CUT = 1 << 24  # a longer incomplete batch, in bytes, is not removed from a file's end
 
 
 def segments_of(path: Path, suffix: str = ".arrows") -> list[tuple[int, Path]]:
@@ -141,7 +141,7 @@ SIZES = {"kB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}  # size in bytes, 
 
 
 class StoredFile(NamedTuple):
-    """The number, newest time and size of a file of a recording in segments."""
+    """A file that holds one or more segments of a recording."""
 
     path: Path
     number: int  # number of the newest segment in the file
@@ -152,13 +152,14 @@ class StoredFile(NamedTuple):
 def outlived(
     files: Iterable[StoredFile], now: float, keep: float | None, most: int | None
 ) -> list[StoredFile]:
-    """Return the files to remove: those older than `keep` s, and the oldest of more than `most` bytes.
+    """Return the files to remove: files older than `keep` s, and then the oldest until `most` bytes are left.
 
     `now` is in s since 1970. None for `keep` or `most` means unlimited. A file with a lower number is older,
     even if the clock was set back.
 
-    A file's age is the time from its newest row to `now`, without gaps longer than `keep` between the newest
-    rows of successive files. So a clock jump or a pause in recording cannot remove every file.
+    A file's age is the time from its newest row to `now`. The time between the newest rows of two successive
+    files does not count if it is longer than `keep`. So a clock jump or a pause in recording cannot remove
+    every file.
     """
     in_order = sorted(files, key=lambda file: file.number)
     ages = {} if keep is None else _ages(in_order, now, keep)
@@ -174,7 +175,10 @@ def outlived(
 
 
 def _ages(files: Iterable[StoredFile], now: float, longest: float) -> dict[int, float]:
-    """Return each file's age in s by number, without gaps between files that are longer than `longest`."""
+    """Return each file's age in s, by file number.
+
+    Time between two successive files does not count if it is longer than `longest` s.
+    """
     ends: dict[int, float] = {}
     for file in files:
         # If a segment is in two files, use the earlier end, because a copy may have a later time.

@@ -135,8 +135,8 @@ class ExportedRows(NamedTuple):
     register: str
     time: Array  # int64, ns UTC
     monotonic_ns: Array
-    uncertainty_ns: Array  # float64; NaN for a miss
-    value: Array  # float64; NaN for a miss
+    uncertainty_ns: Array  # float64; NaN for a missed value
+    value: Array  # float64; NaN for a missed value
     status: Array  # codes, indexes into the list of all statuses
 
 
@@ -262,4 +262,4 @@ class SeriesWriter(RecordingWriter):
 
     @abstractmethod
     def _release(self) -> None:
-        """Close the library's files, if they are open."""
+        """Close the files that h5py or asammdf has open."""

@@ -1,4 +1,4 @@
-"""Draw the health of lines: rates, misses over time, misses against output frequency, response delays."""
+"""Draw the health of lines: rates, response delays, missed values over time and output frequency."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from multidrop.report.style import (
     set_title,
 )
 
-MOST_REASONS = 6  # limit of reasons for misses in a picture; further ones are drawn as "other reasons"
-# A bin with fewer requested values is left out, because its share of misses is not significant.
+MOST_REASONS = 6  # limit of reasons for missed values in a picture; others are drawn as "other reasons"
+# A bin with fewer requested values is left out, because its share of missed values is not significant.
 LEAST_IN_BIN = 20
 BINS = 12  # number of bins into which output frequencies are sorted
 FREQUENCY = "output_frequency"
@@ -69,7 +69,7 @@ def delays(recording: Recording) -> list[DelaySeries]:
 
 
 def _spans_loss(series: Series) -> Array:
-    """Mark each value whose request overlaps a miss: its reply may be a late one to another request."""
+    """Mark values whose reply may belong to another request, which was lost during the same exchange."""
     asked = [number for number, status in enumerate(series.statuses) if not status.startswith(UNASKED)]
     lost = np.unique(series.time[series.missed & np.isin(series.status, asked)])
     next_lost = np.append(lost, np.iinfo(np.int64).max)[np.searchsorted(lost, series.time)]
@@ -119,7 +119,7 @@ def draw_delays(found: Sequence[DelaySeries]) -> Figure:
 
 
 def draw_rates(recording: Recording) -> Figure:
-    """Draw the values per second by drive, and below them the misses per second by reason."""
+    """Draw the values per second by drive, and below them the missed values per second by reason."""
     figure, (rates, misses) = new_figure([2.2, 1.8], sharex=True)
     bins = TimeBins(recording.begin, recording.end)
     for number, drive in enumerate(recording.drives[:MOST_DRIVES]):
@@ -158,8 +158,8 @@ def reasons_of(recording: Recording, drive: str) -> Counter[str]:
 def miss_shares(recording: Recording, drive: str) -> tuple[Array, Array] | None:
     """Return output frequencies in Hz, and the drive's share of missed values near each frequency.
 
-    The frequency of a miss is the last one read before the miss. Values that were not requested are not
-    counted as missed. Return None if there are no misses, if the drive has no frequency register, or if
+    The frequency of a missed value is the last one read before it. Values that were not requested are not
+    counted as missed. Return None if no value was missed, if the drive has no frequency register, or if
     its frequency is constant.
     """
     (frequency, *_) = (*recording.of(drive, FREQUENCY), None)
@@ -185,7 +185,7 @@ def miss_shares(recording: Recording, drive: str) -> tuple[Array, Array] | None:
 
 
 def draw_miss_shares(recording: Recording) -> Figure | None:
-    """Draw the share of misses against output frequency: a slope shows noise that grows with speed."""
+    """Draw the share of missed values against output frequency: a slope shows noise that grows with speed."""
     shares = {drive: miss_shares(recording, drive) for drive in recording.drives[:MOST_DRIVES]}
     if not any(shares.values()):
         return None

@@ -50,7 +50,7 @@ def plot_page(recording: Recording, figure: Figure) -> str:
 
 
 def report_page(recording: Recording) -> str:
-    """Return the report as HTML: use of the lines, rates, misses, delays, faults and values."""
+    """Return the report as HTML: use of the lines, rates, missed values, delays, faults and values."""
     parts = [
         _about(recording),
         *_drives(recording),

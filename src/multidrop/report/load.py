@@ -49,7 +49,7 @@ class TimeSpan:
 
 @dataclass(frozen=True)
 class StepSpan(TimeSpan):
-    """The time of a step of a test run, also in ns of CLOCK_MONOTONIC, which is never set."""
+    """The time of a step of a test run, in ns UTC and also in ns of the monotonic clock."""
 
     monotonic_begin: int
     monotonic_end: int
@@ -57,7 +57,7 @@ class StepSpan(TimeSpan):
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """The rows of one register of one drive, sorted by `time`; `value` is NaN for a miss."""
+    """The rows of one register of one drive, sorted by `time`; `value` is NaN for a missed value."""
 
     drive: str
     register: str
@@ -79,7 +79,7 @@ class Series:
 
     @cached_property
     def drawable(self) -> Array:
-        """The values, with NaN for misses and for values too large to draw."""
+        """The values, with NaN for missed values and for values too large to draw."""
         return np.where(np.abs(self.value) < LARGEST, self.value, np.nan)
 
     @cached_property
@@ -112,7 +112,7 @@ class Series:
         return np.asarray(self.time[self.missed & (self.status == self.statuses.index(reason))])
 
     def faults(self) -> list[TimeSpan]:
-        """Return the time spans in which this fault register was not 0; a miss does not end a span."""
+        """Return the time spans in which this fault register was not 0. Missed values do not end a span."""
         there = ~self.missed
         time, value = self.time[there], self.value[there]
         if not len(time):

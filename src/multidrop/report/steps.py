@@ -12,20 +12,20 @@ import numpy as np
 from multidrop.recording.series import Array
 from multidrop.report.load import Recording, Series, StepSpan
 
-BAND = 0.02  # a value is settled if it differs from the settled value by at most this fraction of its change
-LAST = 0.2  # the settled value is the mean over this last fraction of a step
+BAND = 0.02  # largest distance of a settled value from the final value, as a fraction of the step's change
+LAST = 0.2  # the final value is the mean over this last fraction of a step
 KILOWATTS = {"kW": 1.0, "W": 1e-3}  # units of power, as multiples of 1 kW; their integral is an energy
 
 
 class StepValues(NamedTuple):
     """Figures of one register in one step of a test run. Times are in s; `slope` is in the unit per s.
 
-    `settling` is the time from the start of the step until the value stays near its settled value. That is
-    the mean of the step's last fifth. "Near" means within 2 % of the value's change, or within the register's
-    resolution if that is more. `settling` is None if the value has not settled by the end. `slope` is the
-    slope of a straight line fitted by least squares; None for fewer than two times. `energy` in kWh is the
-    integral of a power by the trapezoidal rule, without the times of missed values. It is None for a register
-    that is not a power.
+    `settling` is the time from the start of the step until the value stays near its final value. The final
+    value is the mean of the step's last fifth. "Near" means within 2 % of the value's change, or within the
+    register's resolution if that is more. `settling` is None if the value has not settled by the end. `slope`
+    is the slope of a straight line fitted by least squares; None for fewer than two times. `energy` in kWh is
+    the integral of a power by the trapezoidal rule, without the times of missed values. It is None for a
+    register that is not a power.
     """
 
     drive: str

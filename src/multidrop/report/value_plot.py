@@ -1,4 +1,4 @@
-"""Draw a recording's values: curves, lanes of states, and marks for faults and misses."""
+"""Draw a recording's values: curves, lanes of states, and marks for faults and missed values."""
 
 from __future__ import annotations
 
@@ -130,7 +130,10 @@ def _of_drives(recording: Recording, drives: Sequence[str], registers: Sequence[
 
 
 def _faults(chosen: Sequence[Series], *, is_alone: bool) -> list[Series]:
-    """Return the fault series of drives that had faults; with `is_alone`, those of all drives."""
+    """Return the fault series of drives that had faults.
+
+    If no drive had a fault and the plot has no other panel (`is_alone`), return those of all drives.
+    """
     polled = [series for series in chosen if series.register == FAULTS]
     return [series for series in polled if series.faults()] or (polled if is_alone else [])
 
@@ -178,7 +181,7 @@ def _draw(axes: Axes, content: Content, recording: Recording) -> None:
 def _add_drives(
     figure: Figure, contents: Sequence[Content], recording: Recording, *, has_misses: bool
 ) -> None:
-    """Add a legend with the drives that have curves, and with the mark of a miss."""
+    """Add a legend with the drives that have curves, and with the mark of a missed value."""
     curves = {series.drive for content in contents for series in content.series if not series.names}
     handles = [
         Line2D([], [], label=label(name), **line_style(number))
@@ -225,7 +228,7 @@ def _fit(axes: Axes, series: Sequence[Series]) -> None:
 
 
 def _mark_misses(axes: Axes, series: Sequence[Series], recording: Recording) -> None:
-    """Draw a tick at the foot of the panel, in the drive's colour, for every miss."""
+    """Draw a tick at the foot of the panel, in the drive's colour, for every missed value."""
     style = {"markersize": 7, "markeredgewidth": 1.2, "transform": axes.get_xaxis_transform()}
     for one in series:
         time = one.time[one.missed]
@@ -293,7 +296,7 @@ def with_pauses(time: Array, value: Array, begins: Array) -> tuple[Array, Array]
 def thinned(time: Array, value: Array) -> tuple[Array, Array]:
     """Reduce a long curve to the least and greatest value of each run of rows.
 
-    A run of misses keeps one miss.
+    Keep one of several consecutive missed values.
     """
     pieces = MOST_POINTS // 2
     if len(time) <= MOST_POINTS:

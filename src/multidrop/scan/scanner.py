@@ -95,7 +95,7 @@ class _Scan:
 
     def _sweep(self, sweep: Sweep, left_after: float) -> Iterator[Finding]:
         addresses = [address for address in sweep.addresses if _key(sweep, address) not in self._found]
-        # by address with invalid replies: a whole frame that does not match its request, and why; or ""
+        # Invalid replies by address: a description of a whole frame that does not match its request, or "".
         garbled: dict[int, str] = {}
         peers: dict[int, Peer] = {}
         for number, address in enumerate(addresses, 1):

@@ -24,8 +24,8 @@ Setting = tuple[Settings, Framing]
 GATEWAY_PATIENCE = 1.0
 ADDRESSES = range(1, 32)  # the addresses that a scan tries by default
 _ILLEGAL_ADDRESS = 2  # code of the Modbus exception "illegal data address"
-# In these tables, a reply with the value 0 equals an echo of the request. So a sweep prefers registers of
-# other tables, or the register with the drive's own address, which is never 0.
+# Tables of Delixi's own protocol. A reply with the value 0 equals an echo of the request. So a scan reads
+# other tables if possible, or the register with the drive's own address, which is never 0.
 _ECHOED = (Carrier.LONG, Carrier.NUMBER)
 
 
@@ -48,7 +48,7 @@ class Sweep:
 
     settings: Settings
     framing: Framing
-    families: tuple[type[Drive], ...]  # families that answer this sweep's request, by their documents
+    families: tuple[type[Drive], ...]  # families whose manuals say that they answer this request
     request: ScanRequest
     addresses: tuple[int, ...]
     silence: float
@@ -136,7 +136,10 @@ def _patient(sweep: Sweep) -> Sweep:
 
 
 def _settings(families: Sequence[type[Drive]]) -> dict[Setting, dict[type[Drive], float]]:
-    """Return each family's likelihood by line setting; the first setting in a manual is the likeliest."""
+    """Return, for each line setting, how likely each family uses it.
+
+    The first setting in a family's manual is the likeliest.
+    """
     found: dict[Setting, dict[type[Drive], float]] = {}
     for family in families:
         for framing in family.framings:

@@ -23,7 +23,7 @@ from multidrop.sim.receiver import Frame
 
 COIL_ON, COIL_OFF = b"\xff\x00", b"\x00\x00"
 
-# Delixi's function codes K.
+# Function codes of Delixi's own protocol.
 COMMAND, STATE, SETPOINT, SET, STORE, QUERY = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07
 NO_DATA = bytes(4)  # unused D3..D0
 

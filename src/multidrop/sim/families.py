@@ -219,7 +219,7 @@ def _printed(fault: int) -> int:
 
 ERMAN_COILS = range(13)  # all coils, including the reserved coils 3 to 8 and 10 to 12
 ERMAN_STOP, ERMAN_EMERGENCY_STOP = 1, 2
-ERMAN_EMERGENCY_STOPPED = 1 << 0  # bit of the last fault register
+ERMAN_EMERGENCY_STOPPED = 1 << 0  # bit of the register `last_fault`
 ERMAN_OVERLOADED = 1 << 5  # bit of the state register
 ERMAN_STATES = {Phase.STOPPED: 0, Phase.CONSTANT: 1, Phase.ACCELERATING: 2, Phase.DECELERATING: 3}
 
@@ -249,7 +249,7 @@ class SimulatedERMAN(MotorDrive):
         self.memory.make_writable(COIL, ERMAN_COILS)
 
     def accepts_broadcast(self, request: Message) -> bool:
-        return True  # by section 6, any request may be sent to address 0
+        return True  # Modbus manual, section 6: any request may be sent to address 0
 
     def _start(self, on: int) -> None:
         if not on:
@@ -438,7 +438,7 @@ class SimulatedYD1000(MotorDrive):
     """
 
     functions = (0x03, 0x06)
-    needs_silence = True  # YD1000 notes, section 4.3
+    needs_silence = True  # YD1000 communication notes, section 4.3
 
     _panel_runs = False
     _in_force = 0  # the control word that was accepted last
@@ -460,7 +460,7 @@ class SimulatedYD1000(MotorDrive):
 
     @property
     def most_gap(self) -> float:
-        return 24 * self.drive.settings.character  # YD1000 notes, section 4.2 (2)
+        return 24 * self.drive.settings.character  # YD1000 communication notes, section 4.2 (2)
 
     def accepts_broadcast(self, request: Message) -> bool:
         return request.function == 0x06 and request.start in (YD_CONTROL, YD_COMMUNICATION_FREQUENCY)

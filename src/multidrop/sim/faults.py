@@ -213,7 +213,7 @@ class FaultyWire(Wire):
         return True
 
     def _damaged(self, frame: bytes) -> bytes:
-        """Return the frame with at most one fault, because a checksum might miss several faults."""
+        """Return the frame with at most one fault, because a checksum might not detect several faults."""
         for fault, damage in DAMAGES.items():
             if self._strikes(fault):
                 return damage(frame, self._random.randrange(len(frame)), self._random.randrange(8))

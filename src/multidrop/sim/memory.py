@@ -69,7 +69,7 @@ class Memory:
         return cell
 
     def declare(self, register: Register[Any]) -> None:
-        """Add the cells of the register, with its factory value."""
+        """Add the words or bits of the register, with its factory value."""
         table = register.table
         for at in range(register.words):
             cell = self._cell(table, register.address + at)

@@ -214,7 +214,7 @@ class Motor:
         return abs(self.shaft) * 60 / self.rating.pole_pairs * (1 - SLIP * max(self.torque, 0.0))
 
 
-# by name of a register: the function that computes its value
+# functions that compute a register's value, by register name
 MONITORS: Mapping[str, Callable[[Motor], float]] = {
     "output_frequency": lambda motor: abs(motor.frequency),
     "reference_frequency": lambda motor: abs(motor.target),
@@ -230,7 +230,7 @@ MONITORS: Mapping[str, Callable[[Motor], float]] = {
     "last_fault": lambda motor: motor.fault_record(1),
 } | {f"fault_record_{nth}": lambda motor, nth=nth: motor.fault_record(nth) for nth in range(1, 5)}
 
-# by name of a register in %: the function that returns the value of 100 %
+# functions that return the value of 100 %, by name of a register in percent
 RATED: Mapping[str, Callable[[Rating], float]] = {
     "output_frequency": lambda rating: rating.frequency,
     "reference_frequency": lambda rating: rating.frequency,
@@ -242,7 +242,7 @@ RATED: Mapping[str, Callable[[Rating], float]] = {
 }
 
 
-COMMANDS: Mapping[str, Callable[[Motor], None]] = {  # by name of a control word: its effect on the motor
+COMMANDS: Mapping[str, Callable[[Motor], None]] = {  # effects on the motor, by name of the control word
     "FORWARD": lambda motor: motor.run(1),
     "REVERSE": lambda motor: motor.run(-1),
     "JOG_FORWARD": lambda motor: motor.jog(1),
@@ -332,7 +332,7 @@ class MotorDrive(SimulatedDrive):
             self.motor.direction = direction
 
     def carry_out_named(self, raw: int) -> None:
-        """Carry out the control word with this raw count, by its name in COMMANDS."""
+        """Carry out the control word with this raw count."""
         COMMANDS[self.drive.register("control").decode(raw).name](self.motor)
 
     def word(self, address: int) -> int:

@@ -111,8 +111,8 @@ class SimulatedProfidrive(ProfileDrive):
     A control word in which OFF1 is active, but not OFF2 or OFF3, allows it again.
 
     `off2` and `off3` are commands from another source, such as a terminal. In local control, or if bit 10 of
-    the word is 0, only the OFF bits have an effect. A word that clears bit 3 lets the motor coast. Of the
-    three ramp bits it is only simulated that the motor runs if all are 1.
+    the word is 0, only the OFF bits have an effect. A word that clears bit 3 lets the motor coast. The motor
+    starts only if all three ramp bits are 1; these bits have no other effect here.
     """
 
     off2 = off3 = False
@@ -188,7 +188,9 @@ _STATES = {DISABLED: 0x40, READY: 0x21, SWITCHED_ON: 0x23, ENABLED: 0x27}
 
 
 class SimulatedCiA402(ProfileDrive):
-    """CiA 402. A control word raises the state by one at most; "disable voltage" or a trip makes it lowest.
+    """CiA 402, with the states DISABLED, READY, SWITCHED_ON and ENABLED.
+
+    A control word moves the drive at most one state towards ENABLED. "disable voltage" or a trip disables it.
 
     The factory settings are the standard's: "shutdown" coasts, and "disable operation" ramps down.
     A drive in local control ignores all words. `stays_off` prevents switching on, as missing mains

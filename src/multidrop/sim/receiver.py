@@ -75,7 +75,7 @@ class Receiver:
         return frames
 
     def silence(self, now: float) -> list[Frame]:
-        """Return the damaged frame that a silence has ended, in a list that is empty without one."""
+        """Return a list with the damaged frame that a silence has ended; [] if there is no such frame."""
         if not self._buffer or now < self._end + self.most_gap:
             return []
         rest = bytes(self._buffer)
@@ -163,8 +163,8 @@ class Receiver:
 def _first_request(data: bytes) -> tuple[int, int, Message] | None:
     """Return index, length and message of the first valid request in `data`; None if there is none.
 
-    The valid bytes may be a part of a longer request, which is still incomplete. If an earlier byte may start
-    such a request, return only a request that ends at the end of `data`.
+    A longer request that starts earlier in `data` may still be incomplete, and contain the found request by
+    chance. In this case, return the found request only if it ends at the end of `data`.
     """
     pending = False
     for at, code in enumerate(data[1:]):

@@ -234,7 +234,7 @@ PR_SET_PDEATHSIG = 1  # option of prctl(2): the signal that a process gets when 
 REMOVE = 'cat; for n in 1 2 3 4 5 6 7 8 9 10; do rm -rf "$0" && exit; sleep 1; done'
 ENDING_S = 10.0  # time limit, in s, for a process that was asked to exit
 NODES = ("n1", "n2", "n3")
-ATTEMPTS = 3  # tries to start the servers: another program may take a free port before a server does
+ATTEMPTS = 3  # attempts to start the servers; one fails if another program takes a server's port first
 STARTING_S = 20.0
 
 CONFIGURATION = """

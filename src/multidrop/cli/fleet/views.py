@@ -144,7 +144,7 @@ def picture(fleet: FleetState, size: tuple[int, int], head: str) -> list[TextLin
 
 
 def _body(fleet: FleetState, width: int, room: int) -> list[str]:
-    """Return rows of text for all gateways, and for as many lines and moves of lines as fit."""
+    """Return the table of all gateways, then as many lines and recent changes of lines' gateways as fit."""
     begin = [
         *gateway_table(fleet, width - 1),
         "",

@@ -58,8 +58,8 @@ class Rotation(NamedTuple):
 class Triggering(NamedTuple):
     """How triggers are recorded, each in its own file."""
 
-    pre: float  # s before a trigger that are recorded
-    post: float  # s after a trigger that are recorded
+    pre: float  # seconds recorded before a trigger
+    post: float  # seconds recorded after a trigger
     # the text of the condition from which each trigger channel is computed
     conditions: Mapping[TriggerSeries, str]
     # registers whose curves are drawn, by the condition's text
@@ -137,16 +137,16 @@ class Moment(NamedTuple):
 
 @dataclass
 class LiveDrive:
-    """A polled drive: its newest values, its misses, its statistics and a history."""
+    """A polled drive: its newest values, its missed values, its statistics and a history."""
 
     line: PlantLine
     polled: PolledDrive
     cycle: float = 0.0  # planned cycle time of the drive's line, in s
     line_utilisation: float = 1.0  # planned utilisation; at 1 and above, polling leaves no spare line time
     newest: dict[str, Row] = field(default_factory=dict)  # each register's newest sample
-    # each register's last miss, if newer than its newest sample
+    # each register's last missed value, if newer than its newest sample
     missed: dict[str, Row] = field(default_factory=dict)
-    last_miss: str = ""  # status of the last miss whose request was sent
+    last_miss: str = ""  # status of the last missed value whose request was sent
     so_far: Statistics = _NOTHING
     recent: Statistics = _NOTHING
     history: deque[float | None] = field(default_factory=lambda: deque(maxlen=HISTORY))
@@ -336,7 +336,7 @@ def triggering_of(plant: Plant, arguments: argparse.Namespace) -> tuple[Plant, T
 
 # ---- the picture of the last trigger ----
 
-MOST_SIGNALS = 4  # limit of lines in the picture
+MOST_SIGNALS = 4  # limit of curves in the picture
 LEAST_COLUMNS = 10  # least width of a curve
 MOST_ROWS = 100_000  # rows read from a recording for a picture; new rows must wait during the reading
 
@@ -397,7 +397,7 @@ class SpanOfTime(NamedTuple):
     def history(self, rows: Iterable[Row], columns: int) -> list[float | None]:
         """Return a value for each column: the value with the largest magnitude among its rows.
 
-        A column without rows has the value of the last row before it: None if that row is a miss.
+        A column without rows has the value of the last row before it: None if that row is a missed value.
         """
         found: dict[int, list[float | None]] = {}
         for row in rows:

@@ -160,7 +160,8 @@ KEYS = {  # maps the bytes that a terminal sends to the key's name
     b"\n": ENTER,
 }
 UNKNOWN = "unknown"
-# Other escape sequences, and their starts. They are dropped whole: F4's ends in S, the key that stops motors.
+# Other escape sequences, and their first bytes. All bytes of a sequence are dropped: the key F4 sends
+# ESC O S, and S alone is the command that stops all motors.
 _SEQUENCE = re.compile(rb"\x1b(?:\[\[?[0-?]*[ -/]*[@-Z\\-~]|O[ -~])")
 _BEGUN = re.compile(rb"\x1b(?:\[\[?[0-?]*[ -/]*|O)?")
 SPLIT_S = 0.05  # how long to wait for the rest of an escape sequence
