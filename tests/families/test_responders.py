@@ -43,7 +43,7 @@ class Sheet:
     after_reset: tuple[Word, ...] = ()  # writes after the reset
     write: int = 6
     shows_setpoint: int = 0  # address of a register that shows the setpoint; 0: there is none
-    # by write: the register values that it causes
+    # write -> register values that it causes
     passes: Mapping[Word, Mapping[int, int]] = field(default_factory=dict)
     standing: Condition = Condition.STOPPED  # condition that the drive reports at rest
     failed: Condition = Condition.FAULT  # condition that the drive reports in a fault
@@ -63,7 +63,7 @@ ERMAN = Sheet(
     (COIL + 9, ON),
     before_reset=((COIL + 0, 0),),
     after_reset=((COIL + 9, 0),),
-    # 0402H is the last fault, which may be over, so the state shows only that the motor is at rest
+    # 0402H is the last fault, which may have been reset, so the state shows only that the motor is at rest
     failed=Condition.STOPPED,
 )
 # CP2000 manual p. 12.1-09-8, MS300 p. 788 to 790, VFD-EL-W p. 4-83: bits 1 and 0 of 2101H are 00 at rest.
@@ -266,7 +266,8 @@ SHEETS = {
         after_reset=((8501, 0x07),),
         passes={(8501, 6): {3201: 0x0231}, (8501, 7): {3201: 0x0233}},
     ),
-    # V20 manual (10/2019) p. 187, S120 p. 171: 047E is OFF1, bit 0 runs, bit 7 resets; 40100 is address 99.
+    # V20 manual (10/2019) p. 187, S120 p. 171: the control word 047EH stops (OFF1), bit 0 runs the motor,
+    # bit 7 resets a fault. Register 40100 has the address 99.
     "siemens-v20": Sheet(
         {99: 0, 100: 0, 109: 0x0231, 110: 0, 15: 5000, 23: 0, 25: 0, 29: 540},
         {"output_frequency": 20, "output_current": 8.4, "dc_bus_voltage": 540},
@@ -292,7 +293,8 @@ SHEETS = {
         after_reset=((0, 0x047E),),
         passes={(0, 0x0477): {3: 0x0233}},
     ),
-    # FC 51 MG02A4 p. 29 and 33: register 50000 is address 49999; 4000H is 100 %; STW bit 3 trip, 11 running.
+    # FC 51 MG02A4 p. 29 and 33: register 50000 has the address 49999; 4000H is 100 %.
+    # Status bits: 3 tripped, 11 running.
     "danfoss-fc51": Sheet(
         {50199: 0x0207, 50209: 0, 16129: 0, 16299: 540, 8299: 2, 8309: 1},
         {"output_frequency": 20, "main_actual_value": 40, "dc_bus_voltage": 540},
@@ -304,7 +306,8 @@ SHEETS = {
         (49999, 0x04BC),
         after_reset=((49999, 0x043C),),
     ),
-    # ODE-3 user guide p. 33: register 1 is address 0; E3 manual p. 35: bit 0 runs, 1 trip, 6 ready.
+    # ODE-3 user guide p. 33: register 1 has the address 0. E3 manual p. 35, status bits: 0 running,
+    # 1 tripped, 6 ready.
     "optidrive-e3": Sheet(
         {0: 0, 1: 0, 5: 0x0040, 6: 0, 7: 0, 22: 540, 139: 3},
         {"output_frequency": 20, "output_current": 8.4, "dc_bus_voltage": 540},

@@ -492,7 +492,7 @@ def test_yd1000_terminals_without_a_run_function_do_not_block_a_reset(closed: In
 
 
 def test_error_of_an_inferred_yd1000_limit_names_its_source() -> None:
-    """By the notes, the upper frequency limit is at most the maximum frequency. The reverse is inferred."""
+    """The document limits the upper frequency limit by the maximum frequency; the reverse is inferred."""
     wire = Wire(YD1000(1), {**STANDING, "upper_limit_frequency": 60.0})
     with pytest.raises(
         WriteForbidden, match=r"50\.00 Hz is below upper_limit_frequency, which is 60 Hz"

@@ -19,7 +19,7 @@ from multidrop.drive.text import Text
 from multidrop.printable import is_whole
 
 LAST_ADDRESS = 0xFFFF
-LONGEST_TIME = 60.0  # s; a larger number was probably meant in ms
+LONGEST_TIME = 60.0  # limit of times in s: a larger number was probably meant in ms
 MOST_CHARACTERS = 1000
 UNIT_IDS = range(256)  # unit ids on Modbus TCP; a serial line has fewer addresses
 EXCEPTION_CODES = range(1, 256)

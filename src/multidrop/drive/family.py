@@ -38,8 +38,8 @@ from multidrop.drive.verbs import (
 from multidrop.errors import Advice, NotVerified, Unconfirmed, Unsupported, WriteForbidden
 from multidrop.printable import did_you_mean
 
-START_TIME = 5.0  # s within which a started motor must be seen to turn
-REVERSAL_TIME = 60.0  # s allowed for a reversal of the motor if the option `stop_time` is not given
+START_TIME = 5.0  # seconds within which a started motor must be seen to turn
+REVERSAL_TIME = 60.0  # seconds allowed for a reversal without the option `stop_time`
 _SETPOINT_FIRST = Advice("call set_frequency before start", "add --frequency HZ")
 _TURNING = (Condition.RUNNING, Condition.ACCELERATING, Condition.DECELERATING)
 
@@ -73,16 +73,16 @@ class Drive(RegisterAccess):
     line_terminals: ClassVar[str] = ""  # the manual's names of the drive's two RS-485 terminals
     most_devices: ClassVar[int] = 0  # limit of devices on an RS-485 line with such a drive; 0: not stated
 
-    silence: ClassVar[float] = 0.0  # s of silence before and after a frame; RTU needs at least 3.5 characters
+    silence: ClassVar[float] = 0.0  # seconds before and after a frame; RTU needs 3.5 characters
     # `silence` as a number of characters; the longer silence applies
     silence_characters: ClassVar[float] = 0.0
     response_delay: float = 0.005  # typical time in s from the end of a request to the start of the reply
     # `response_delay` as a number of characters; the longer delay applies
     response_delay_characters: ClassVar[float] = 0.0
-    response_timeout: ClassVar[float] = 0.3  # s without a reply after which a request has failed
-    # s within which the drive replies, according to its document; 0: not stated
+    response_timeout: ClassVar[float] = 0.3  # seconds without a reply after which a request has failed
+    # seconds within which the drive replies, according to its document; 0: not stated
     answering_time: ClassVar[float] = 0.0
-    turnaround_delay: ClassVar[float] = 0.1  # s without requests after a broadcast
+    turnaround_delay: ClassVar[float] = 0.1  # seconds without requests after a broadcast
     least_interval: ClassVar[float] = 0.0  # shortest time between a reply and the next request, in s
     # True if the drive answers every read of its tables, with a value or an exception
     answers_every_read: ClassVar[bool] = False

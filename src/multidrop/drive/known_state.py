@@ -14,7 +14,7 @@ from multidrop.errors import BusError
 
 MOST_STEPS = 20
 FAULT = "fault"  # name of the register with the fault code, in every family that has one
-# registers with the newest fault, which may be over
+# registers with the newest fault, which may have been reset
 FAULT_RECORDS = ("last_fault", "fault_record_1")
 
 

@@ -190,8 +190,8 @@ VERBS = (
     *("release_control", "state"),
 )
 
-# By verb: the name of its argument, the allowed types, and their description in errors. Without the check of
-# types, the text "reverse" would run the motor forward.
+# verb -> name of its argument, allowed types, and their description in errors. Without the check of types,
+# the text "reverse" would run the motor forward.
 _TAKES: Mapping[str, tuple[str, tuple[type, ...], str]] = {
     "start": ("direction", (Direction, type(None)), "Direction.FORWARD or Direction.REVERSE"),
     "jog": ("direction", (Direction, type(None)), "Direction.FORWARD or Direction.REVERSE"),
@@ -398,7 +398,7 @@ def _hertz(value: object) -> float:
     return float(value)
 
 
-# By verb: its options, each with the function that converts a JSON value.
+# verb -> its options, each with the function that converts a JSON value
 VERB_OPTIONS: Mapping[str, Mapping[str, Callable[[object], Any]]] = {
     "start": {"direction": _direction},
     "jog": {"direction": _direction},

@@ -24,7 +24,7 @@ from multidrop.drive.register import (
 from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.verbs import Script, insist, read, verb, write
 
-# s; default time limit of a stop, because the parameter number of the deceleration time is not known
+# seconds allowed for a stop by default, because the number of the deceleration time is not known
 STOP_TIME = 60.0
 
 KEYPAD = "it sets up the line, or decides what commands the motor; set it on the keypad"
@@ -91,7 +91,7 @@ class DelixiParameters(Drive):
     addresses = range(1, 32)  # P04.30
     response_timeout = 0.15
     answers_every_read = True
-    answering_time = 0.08  # s; the drive replies within this time
+    answering_time = 0.08  # seconds within which the drive replies
     remote = "P00.00 must be 2 (RS-485)"
     line_parameters = (
         "P04.28 baud rate (0 to 5: 1200, 2400, 4800, 9600, 19200, 38400), P04.29 format (its codes are those "

@@ -23,8 +23,8 @@ from multidrop.drive.register import (
 from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.verbs import Script, insist, read, verb, write
 
-STOP_MARGIN = 5.0  # s; time that a stop may take in addition to the deceleration time
-UNKNOWN_RAMP = 30.0  # s; time allowed for a stop if the deceleration time cannot be read
+STOP_MARGIN = 5.0  # seconds that a stop may take in addition to the deceleration time
+UNKNOWN_RAMP = 30.0  # seconds allowed for a stop if the deceleration time cannot be read
 
 
 class Coil(IntEnum):

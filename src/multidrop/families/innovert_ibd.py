@@ -11,7 +11,7 @@ from multidrop.drive.register import HOLDING, command, reading, setting
 from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.verbs import Script, insist, read, verb, write
 
-STOP_MARGIN = 5.0  # s; time that a stop may take in addition to the deceleration time
+STOP_MARGIN = 5.0  # seconds that a stop may take in addition to the deceleration time
 
 # bits of PrA.22 without a name; and those that are 1 in the manual's example
 UNNAMED, UNNAMED_AS_1 = 0xD800, 0x1800
@@ -139,7 +139,7 @@ class InnovertIBD(Drive):
     line_terminals = "RS+ and RS-"
     addresses = range(1, 241)
     answers_every_read = True
-    silence = 10e-3  # s of silence before and after an RTU frame (table "message in RTU mode")
+    silence = 10e-3  # seconds of silence before and after an RTU frame (table "message in RTU mode")
     most_registers = {HOLDING: 4}
     exceptions = {}
     broadcasts = True

@@ -36,7 +36,7 @@ CHE100_NEXT = "CHE100 manual v1.4, p. 118"
 CHE100_CODES = "CHE100 manual v1.4, p. 119"
 SCALE = f"{CHE100}; scale: Goodrive300L manual, p. 130 (compatible with CHF100A and CHV100)"
 
-STOP_TIME = 60.0  # s; default time limit of a stop, because the address of the deceleration time is not known
+STOP_TIME = 60.0  # seconds allowed for a stop by default: the deceleration time has no known address
 
 
 class CHEControl(IntEnum):

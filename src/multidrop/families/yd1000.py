@@ -15,10 +15,10 @@ from multidrop.drive.register import HOLDING, Details, Kept, Register, command, 
 from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.verbs import Pulse, Script, insist, read, until, verb, wait, write
 
-STOP_MARGIN = 5.0  # s; time that a stop may take in addition to the deceleration time
-SELECTION_TIME = 1.0  # s within which register 1202H must show a newly selected preset speed
-RELEASE_TIME = 2.0  # s in which a motor that the panel or the terminals started is seen to turn
-RESET_TIME = 3.0  # s; the drive may not reply for this long while it restarts
+STOP_MARGIN = 5.0  # seconds that a stop may take in addition to the deceleration time
+SELECTION_TIME = 1.0  # seconds within which register 1202H must show a newly selected preset speed
+RELEASE_TIME = 2.0  # seconds in which a motor that the panel or the terminals started is seen to turn
+RESET_TIME = 3.0  # seconds of a restart, in which the drive may not reply
 
 PANEL = "it is effective from the panel only"
 LINE = "it changes the drive's end of the line; set it on the panel"
@@ -218,7 +218,7 @@ class YD1000(Drive):
         "F800 baud rate (0 to 3: 1200, 2400, 4800, 9600; it must be 3, and an S7e is fixed at 1200), F801 "
         "parity (0 none, 1 even, 2 odd; it must be 1), both in effect after a reset or power-on; F802 address"
     )
-    parameter_space = ParameterSpace(  # manual, sections 6.1, 6.2 and 7
+    parameter_space = ParameterSpace(  # document, sections 6.1, 6.2 and 7
         groups=(
             ParameterGroup("", 0x0000, range(25), digits=4, as_hex=True),
             ParameterGroup("F", 0x0000, range(100, 900), digits=3, as_hex=True),
@@ -241,7 +241,7 @@ class YD1000(Drive):
         "the longest gap between two polls."
     )
 
-    # Basic parameters (section 6.1 of the notes)
+    # Basic parameters (document, section 6.1)
     automatic_ramp = choice(0x0000, "6.1, AU1", 1, default=0)
     automatic_torque_boost = choice(0x0001, "6.1, AU2", default=0, while_running=False, never=PANEL)
     automatic_environment = choice(
@@ -274,7 +274,7 @@ class YD1000(Drive):
     preset_speed_6 = preset(0x0023, "6.1, SR6")
     preset_speed_7 = preset(0x0024, "6.1, SR7")
 
-    # Extended parameters (section 6.2 of the notes)
+    # Extended parameters (document, section 6.2)
     low_speed_frequency = hertz(0x0100, "6.2, F100", at_most="maximum_frequency", default=0.0)
     speed_reach_frequency = hertz(0x0101, "6.2, F101", at_most="maximum_frequency", default=0.0)
     speed_reach_band = hertz(0x0102, "6.2, F102", at_most="maximum_frequency", default=2.5)
@@ -289,7 +289,7 @@ class YD1000(Drive):
     output_1_function = choice(0x0130, "6.2, F130", 9, default=4)
     output_2_function = choice(0x0131, "6.2, F131", 9, default=6)
 
-    # Commands (section 6.3 of the notes)
+    # Commands (document, section 6.3)
     control = command(
         0x1000,
         YD1000Control,
@@ -323,10 +323,10 @@ class YD1000(Drive):
         place="6.3: 1002",
     )
 
-    # Live values (manual, section 6.4)
+    # Live values (document, section 6.4)
     output_frequency = reading(0x1100, "Hz", step=0.01, place="6.4: 1100")
 
-    # Section 6.5
+    # Values that a trip freezes, and others (document, section 6.5)
     held_frequency = reading(
         0x1200, "Hz", step=0.01, place="6.5: 1200", note="The output frequency; frozen in a trip."
     )
@@ -345,7 +345,7 @@ class YD1000(Drive):
     fault_record_4 = reading(0x1213, place="6.5: 1213", note="A code; the table of faults is missing.")
     run_hours = reading(0x1214, "h", step=1, place="6.5: 1214")
 
-    # Communication parameters (manual, section 7)
+    # Communication parameters (document, section 7)
     baudrate_setting = setting(
         0x0800, YD1000Baudrate, kept=Kept.EEPROM, never=LINE, place="7 (1), F800", note=AFTER_RESET
     )

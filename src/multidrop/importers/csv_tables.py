@@ -109,7 +109,7 @@ _WRITES = {5: "coil", 6: "holding", 15: "coil", 16: "holding"}
 _BARE_HEX = re.compile(r"(?=[0-9]*[a-fA-F])[0-9a-fA-F]{1,8}")
 # addresses such as 40001 or 400001: a digit for the table, then a number from 1
 _REFERENCE = re.compile(r"[0134][0-9]{4,5}")
-_ACCESS = {  # by cell: whether the register can be read, and whether it can be written
+_ACCESS = {  # cell -> whether the register can be read, and whether it can be written
     **dict.fromkeys(("r", "ro", "read", "readonly", "rd"), (True, False)),
     **dict.fromkeys(("w", "wo", "write", "writeonly"), (False, True)),
     **dict.fromkeys(
@@ -254,7 +254,7 @@ def _row(devices: dict[int | None, ImportedDevice], cells: Cells, gaps: list[str
 
 
 def _placed(name: str, cells: Cells, tag: _Tag | None) -> ImportedRegister:
-    """Return a register at the row's address. An ambiguous table or numbering is noted in the family file."""
+    """Return a register at the row's address. The family file reports an ambiguous table or numbering."""
     register = ImportedRegister(name, 0)
     stated = _table(register, cells)
     given = tag.address if tag else cells["at"]
@@ -315,7 +315,7 @@ def _is_one(cell: str) -> bool:
 
 
 def _table(register: ImportedRegister, cells: Cells) -> str | None:
-    """Return the table that a row states, or None. An unclear or unknown cell is noted in the family file."""
+    """Return the table that a row states, or None. The family file reports an unclear or unknown cell."""
     if function := cells.get("function"):
         codes = {int(code, 0) for code in re.findall(r"0x[0-9a-f]{1,4}|(?!0\d)\d{1,5}", function.lower())}
         tables = {(_FUNCTIONS | _WRITES).get(code) for code in codes}
@@ -369,7 +369,7 @@ def _fill(device: ImportedDevice, register: ImportedRegister, cells: Cells, tag:
 
 
 def _access(register: ImportedRegister, given: str) -> None:
-    """Set whether the register can be read and written. An unknown word is noted in the family file."""
+    """Set whether the register can be read and written. An unknown word is reported in the family file."""
     words = re.sub(r"subscribe|static|only|[^a-z]", "", given.lower())
     if not given:
         return
@@ -432,7 +432,7 @@ def _number(device: ImportedDevice, register: ImportedRegister, cells: Cells, ta
 def _part(register: ImportedRegister, kind: str, cells: Cells, tag: _Tag | None) -> str:
     """Return the bits of the word that the register uses; "" for all.
 
-    A missing bit number is noted in the family file.
+    A missing bit number is reported in the family file.
     """
     if tag and tag.part:
         return tag.part
@@ -449,7 +449,7 @@ def _part(register: ImportedRegister, kind: str, cells: Cells, tag: _Tag | None)
 
 
 def _format(register: ImportedRegister, kind: str, cells: Cells) -> str | None:
-    """Return the number format of a row. A missing type or width is noted in the family file."""
+    """Return the number format of a row. A missing type or width is reported in the family file."""
     length = cells.get("length", "")
     words = int(length) if _NUMBER.fullmatch(length) else 0
     signed = _SIGNED.get(cells.get("signed", "").lower())
@@ -479,7 +479,7 @@ def _format(register: ImportedRegister, kind: str, cells: Cells) -> str | None:
 
 
 def _order(register: ImportedRegister, given: str) -> str:
-    """Return the byte order that a cell states. A missing byte order is noted in the family file."""
+    """Return the byte order that a cell states. A missing byte order is reported in the family file."""
     word = re.sub(r"[^a-z]|endian|first", "", given.lower())
     if not given:
         register.gaps.append("the order of its words is not stated")
@@ -568,7 +568,7 @@ def _parse_tag(cell: str) -> _Tag | None:
 
 
 def _tag_order(register: ImportedRegister, tag: _Tag, number: str) -> str:
-    """Return a number's byte order. If the Neuron tag does not state it, that is noted in the family file."""
+    """Return a number's byte order. The family file reports a Neuron tag that does not state it."""
     if tag.order in _TAG_ORDERS:
         return _TAG_ORDERS[tag.order]
     if tag.order:

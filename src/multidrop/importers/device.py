@@ -168,13 +168,13 @@ class ImportedRegister:
     of_writes: dict[str, Any] = field(default_factory=dict)  # keys of the family file for a written register
 
     def note_write(self, *, is_written: bool = True) -> None:
-        """Record whether the source program writes the register; a write is noted in the family file."""
+        """Record whether the source program writes the register; a write is reported in the family file."""
         self.is_written = is_written
         if is_written:
             self.gaps.append(WRITTEN)
 
     def put_names(self, key: str, pairs: Mapping[Any, Any]) -> None:
-        """Add names of the register's values or bits. Invalid names are noted in the family file.
+        """Add names of the register's values or bits. Invalid names are reported in the family file.
 
         If a value or bit has several names, the first is used.
         """

@@ -260,7 +260,7 @@ def _add(device: ImportedDevice, kind: str, name: str, entry: Mapping[str, Any])
 def _filters(register: ImportedRegister, filters: Any) -> None:
     """Combine factors and offsets into a step and an offset, in their order.
 
-    Other filters are noted in the family file.
+    Other filters are reported in the family file.
     """
     step, offset = Fraction(1), Fraction(0)
     others: list[str] = []

@@ -240,7 +240,7 @@ def _add(device: ImportedDevice, kind: str, name: str, entry: Mapping[str, Any])
 def _verify(register: ImportedRegister, entry: Mapping[str, Any]) -> None:
     """Read the state of a switch from its state register, if it has one.
 
-    Values for on and off other than 1 and 0 are noted in the family file.
+    Values for on and off other than 1 and 0 are reported in the family file.
     """
     on, off = entry.get("command_on", 1), entry.get("command_off", 0)
     verify = entry.get("verify")
@@ -298,7 +298,7 @@ def _swap(register: ImportedRegister, entry: Mapping[str, Any]) -> str:
 
 
 def _format(register: ImportedRegister, kind: str, entry: Mapping[str, Any]) -> str | None:
-    """Return the number format of a data type, or None. A doubtful width is noted in the family file."""
+    """Return the number format of a data type, or None. A doubtful width is reported in the family file."""
     registers = whole(entry, "count", 1)
     if kind in _LEGACY_TYPES:
         # applies only to floats, because an int has 16 bits in every version

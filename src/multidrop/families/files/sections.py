@@ -118,9 +118,9 @@ FAMILY_KEYS = {
 _TEXTS = {"title": "title", "manual": "manual", "remote": "remote", "watchdog": "watchdog"}
 _TEXTS |= {"motor": "has_motor", "line_parameters": "line_parameters", "note": "__doc__"}
 _DURATIONS = ("silence", "least_interval", "response_delay", "response_timeout", "turnaround_delay")
-# s; limit of the drive's pauses, because a stop of another drive may have to wait as long
+# limits in s of the drive's pauses, because a stop of another drive may have to wait as long
 LONGEST_WAIT = 10.0
-_LONGEST = {"silence": LONGEST_SILENCE, "least_interval": LONGEST_INTERVAL}  # s
+_LONGEST = {"silence": LONGEST_SILENCE, "least_interval": LONGEST_INTERVAL}
 
 
 def facts_of(given: Mapping[str, Any], counting: Counting, place: TomlPlace) -> dict[str, Any]:

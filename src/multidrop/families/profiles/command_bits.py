@@ -16,7 +16,7 @@ from multidrop.drive.state import Condition, Direction
 from multidrop.drive.verbs import Script, insist, until, wait, write
 from multidrop.families.profiles.profile import COMMON, Profile, Role
 
-READY_TIME = 1.0  # s allowed for each state change before the start word is sent
+READY_TIME = 1.0  # seconds allowed for each state change before the start word is sent
 
 
 # ---- CiA 402 ----
@@ -132,7 +132,7 @@ class CiA402(Profile):
 
 # ---- PROFIdrive ----
 
-# s; shortest pause between "ready to switch on" and the next control word (ACS550-02/U2 manual, p. 246)
+# shortest pause between "ready to switch on" and the next control word, in s (ACS550-02/U2 manual, p. 246)
 BETWEEN = 0.1
 
 

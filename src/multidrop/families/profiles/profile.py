@@ -188,10 +188,10 @@ def _enumeration(kind: Any, name: str, members: dict[str, int]) -> type[Any]:
     return cast(type[Any], kind(name, members))
 
 
-# s; default time limit of a stop, because profiles have no register for the deceleration time
+# seconds allowed for a stop by default, because profiles have no register for the deceleration time
 STOP_TIME = 60.0
 UNUSED = (0, 0xFFFF)  # values of an unused register, or of a gateway whose drive is absent
-RESET_TIME = 2.0  # s within which the status must no longer show a fault after its reset
+RESET_TIME = 2.0  # seconds within which the status must no longer show a fault after its reset
 
 
 class Profile(Drive):
