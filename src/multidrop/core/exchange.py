@@ -10,8 +10,7 @@ from itertools import count
 from typing import Any, Literal, NamedTuple
 
 from multidrop._core import ffi, lib
-from multidrop.core.columns import RowLayout, number_at
-from multidrop.core.memory import new_apart, new_beside
+from multidrop.core.columns import RowLayout, new_beside, number_at
 from multidrop.core.permissions import Permit
 
 crc16 = lib.md_crc16
@@ -528,28 +527,28 @@ class Exchange:
         self.permit = permit
         self.settings = (baudrate, format)
         self.c: Any
-        is_polled = block is not None and block.count > 0
-        self.c, self._memory = (new_beside if is_polled else new_apart)(
-            "struct md_exchange",
-            {
-                "framing": framing,
-                "request": to_c(request)[0],
-                "frame_len": len(kept),
-                "frame": list(kept),
-                "settings": settings_to_c(baudrate, format),
-                "character_ns": round(character * 1e9),
-                "silence_ns": round(silence * 1e9),
-                "turnaround_ns": round(turnaround * 1e9),
-                "period_ns": round(period * 1e9),
-                "insists": insists,
-                "timeout_ns": round(timeout * 1e9),
-                "least": least,
-                "end": most + 1,
-                "drive": peer.c,
-                "block": block.c if block else ffi.NULL,
-                "echo_probe": echo_probe.c if echo_probe else ffi.NULL,
-                "stops": permit.latch.c if permit else ffi.NULL,
-                "stops_seen": permit.seen if permit else 0,
-                "values": values.c if values else ffi.NULL,
-            },
-        )
+        fields = {
+            "framing": framing,
+            "request": to_c(request)[0],
+            "frame_len": len(kept),
+            "frame": list(kept),
+            "settings": settings_to_c(baudrate, format),
+            "character_ns": round(character * 1e9),
+            "silence_ns": round(silence * 1e9),
+            "turnaround_ns": round(turnaround * 1e9),
+            "period_ns": round(period * 1e9),
+            "insists": insists,
+            "timeout_ns": round(timeout * 1e9),
+            "least": least,
+            "end": most + 1,
+            "drive": peer.c,
+            "block": block.c if block else ffi.NULL,
+            "echo_probe": echo_probe.c if echo_probe else ffi.NULL,
+            "stops": permit.latch.c if permit else ffi.NULL,
+            "stops_seen": permit.seen if permit else 0,
+            "values": values.c if values else ffi.NULL,
+        }
+        if block is not None and block.count > 0:
+            self.c, self._memory = new_beside("struct md_exchange", fields)
+        else:  # rarely used, so its place in memory does not matter
+            self.c = self._memory = ffi.new("struct md_exchange *", fields)
