@@ -1,8 +1,13 @@
-"""Mastership: a deadline on CLOCK_BOOTTIME. If the process is suspended beyond it, the kernel kills it."""
+"""Mastership: a deadline on CLOCK_BOOTTIME. If the process is suspended beyond it, the kernel kills it.
+
+The last tests suspend a master, and look for its bytes at the far ends of lines that another master took
+over. `python -m bench.questions.safety.fence` repeats these tests 2,000 times.
+"""
 
 from __future__ import annotations
 
 import os
+import random
 import signal
 import subprocess
 import sys
@@ -10,8 +15,10 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import pytest
+from fencing import Fence, Round
 from kills import BoundProcess
 from tables import table
 
@@ -192,3 +199,60 @@ def test_a_forked_child_does_not_hold_its_parents_mastership() -> None:
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
     assert mastership.holds
     mastership.end()
+
+
+# ---- suspended masters ----
+
+
+LINES, LEASE, GUARD = 10, 0.4, 0.3  # number of lines; lease and guard time in s
+WATCHES_SUSPENSION = pytest.mark.skipif(
+    not hasattr(os, "pidfd_open"),
+    reason="this Python was built without pidfd_open, which the test watches by",
+)
+
+
+@contextmanager
+def fence(**details: Any) -> Iterator[Fence]:
+    made = Fence(LINES, LEASE, GUARD, **details)
+    try:
+        yield made
+    finally:
+        made.close()
+
+
+def rounds(made: Fence, stops: int) -> list[Round]:
+    chance = random.Random(15)
+    return [made.stop_once(chance) for _ in range(stops)]
+
+
+@WATCHES_SUSPENSION
+@pytest.mark.long
+@pytest.mark.slow
+def test_a_suspended_master_sends_nothing_and_is_killed() -> None:
+    with fence() as made:
+        found = rounds(made, 10)
+    assert [each.stale for each in found] == [0] * 10
+    assert all(each.is_killed for each in found)
+
+
+@WATCHES_SUSPENSION
+@pytest.mark.long
+@pytest.mark.slow
+def test_a_suspended_master_sends_nothing_after_it_resumes() -> None:
+    """The kernel's timer is hours away, so only the check of the clock prevents sending."""
+    with fence(timer=3600) as made:
+        found = rounds(made, 6)
+    assert not any(each.is_killed for each in found)
+    # once in a thousand suspensions, the master is suspended after the check and sends one request
+    assert sum(each.stale for each in found) <= 1
+
+
+@WATCHES_SUSPENSION
+@pytest.mark.long
+@pytest.mark.slow
+def test_a_suspended_master_with_a_deadline_that_is_too_late_does_send() -> None:
+    """This shows that the tests above can fail: here the master's deadline is too late."""
+    with fence(beyond=1000) as made:
+        found = rounds(made, 4)
+    assert any(each.stale > 0 for each in found)  # on a busy computer, some masters resume too late to send
+    assert not any(each.is_killed for each in found)
