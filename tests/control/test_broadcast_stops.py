@@ -11,8 +11,7 @@ import pytest
 from examples import every_third
 from line_driver import MS, LineDriver
 from motors import MAKE, STARTS
-from simulated_bus import SimulatedBus, is_write, one
-from stop_frames import all_stopped, che_drives
+from simulated_bus import SimulatedBus, all_stopped, che_drives, is_write, one
 from tables import table
 from toy import Status, Toy
 

@@ -10,8 +10,7 @@ from unittest.mock import patch
 import pytest
 from lines import line, plant, polled, until
 from motors import MAKE, ReceivedRequests, at_highest_rate
-from simulated_bus import SimulatedBus, is_write, one
-from stop_frames import STOPS, first, writes
+from simulated_bus import STOPS, SimulatedBus, first, is_write, one, writes
 from tables import table
 
 from multidrop import Bus, Drive, InnovertIBD, InvtCHE, NoReply, Poller, Unconfirmed, WriteForbidden

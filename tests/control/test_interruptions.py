@@ -13,8 +13,7 @@ import pytest
 from interruptions import interrupted_at
 from lines import PATIENCE
 from motors import MAKE, STARTS, ReceivedRequests
-from simulated_bus import SimulatedBus, is_write, one
-from stop_frames import STOPS, Own, first, writes
+from simulated_bus import STOPS, Own, SimulatedBus, first, is_write, one, writes
 
 from multidrop import Bus
 from multidrop.control.outcome import Seen

@@ -12,8 +12,7 @@ from weakref import ref
 
 import pytest
 from lines import until
-from simulated_bus import SimulatedBus, one
-from stop_frames import che_drives
+from simulated_bus import SimulatedBus, che_drives, one
 
 from multidrop.core import Message
 from multidrop.core.process import flush_log

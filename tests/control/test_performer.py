@@ -12,8 +12,7 @@ import pytest
 from examples import usually
 from motors import MAKE
 from profile_families import MAKE as PROFILES
-from simulated_bus import SimulatedBus, is_write, one
-from stop_frames import Meanwhile, starts, writes
+from simulated_bus import Meanwhile, SimulatedBus, is_write, one, starts, writes
 from tables import table
 
 from multidrop import DelixiNative, InnovertIBD

@@ -13,8 +13,7 @@ import pytest
 from lines import PATIENCE
 from motors import MAKE
 from profile_families import MAKE as PROFILES
-from simulated_bus import SimulatedBus, is_write, one
-from stop_frames import all_stopped, che_drives, starts
+from simulated_bus import SimulatedBus, all_stopped, che_drives, is_write, one, starts
 from tables import table
 from toy import Toy
 

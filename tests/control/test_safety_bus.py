@@ -9,8 +9,7 @@ from typing import Any
 import pytest
 from batches import completed
 from motors import MAKE
-from simulated_bus import EXCHANGE_TIME, SimulatedBus, is_write, one
-from stop_frames import starts
+from simulated_bus import EXCHANGE_TIME, SimulatedBus, is_write, one, starts
 from tables import table
 from toy import Toy
 

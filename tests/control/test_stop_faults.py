@@ -22,8 +22,7 @@ from interruptions import calling_at, failing_at, interrupted_at
 from motors import MAKE
 from own_drives import Fan
 from profile_families import ALL
-from simulated_bus import SimulatedBus, is_write, one
-from stop_frames import che_drives
+from simulated_bus import SimulatedBus, che_drives, is_write, one
 from tables import table
 
 import multidrop

@@ -13,8 +13,21 @@ from typing import Any
 
 import pytest
 from motors import MAKE, STARTS
-from simulated_bus import EXCHANGE_TIME, TIMEOUT, SimulatedBus, is_write, one
-from stop_frames import STOPS, Meanwhile, Own, che_drives, first, plain_stop, started_while, writes
+from simulated_bus import (
+    EXCHANGE_TIME,
+    STOPS,
+    TIMEOUT,
+    Meanwhile,
+    Own,
+    SimulatedBus,
+    che_drives,
+    first,
+    is_write,
+    one,
+    plain_stop,
+    started_while,
+    writes,
+)
 
 from multidrop.control.commands import stop_drive
 from multidrop.control.outcome import UNSEEN, Seen

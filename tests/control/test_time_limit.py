@@ -14,8 +14,7 @@ from typing import Any
 import pytest
 from motors import MAKE, STARTS
 from peers import preloaded
-from simulated_bus import EXCHANGE_TIME, SimulatedBus, one
-from stop_frames import Own, first, started_while, writes
+from simulated_bus import EXCHANGE_TIME, Own, SimulatedBus, first, one, started_while, writes
 from tables import table
 
 from multidrop.bus import Bus
