@@ -19,10 +19,10 @@ from modbus_gateway import DONE, PATIENCE, FakeLine, Gateway, RawClient, RawRepl
 from multidrop import Drive, reading
 from multidrop.control import CommandResult
 from multidrop.families import InvtCHE
-from multidrop.gateway.modbus_server import clients as modbus_clients
-from multidrop.gateway.modbus_server.clients import ModbusClient, ModbusPort
+from multidrop.gateway.modbus_server import server as modbus_server
 from multidrop.gateway.modbus_server.passed_requests import BURST_S, EXPIRY_S, MOST_WAITING, SHARE, LineShare
 from multidrop.gateway.modbus_server.protocol import MbapRequest, PassingBusy, take_request
+from multidrop.gateway.modbus_server.server import ModbusClient, ModbusPort
 from multidrop.gateway.modbus_server.settings import ModbusSettings
 
 UNREAD = 150_000  # so many requests that their answers do not fit into the socket buffers of both sides
@@ -111,7 +111,7 @@ async def test_a_flooding_client_does_not_delay_other_clients() -> None:
     flood, flooded = connected(port)
     other, answered = connected(port)
     flood.data_received(b"".join(request(number, 1, 3, 0, 1) for number in range(1000)))
-    assert len(transactions(flooded.written)) == modbus_clients.SLICE
+    assert len(transactions(flooded.written)) == modbus_server.SLICE
     other.data_received(request(1, 1, 3, 0, 1))
     assert transactions(answered.written) == [1]
     await asyncio.sleep(1)
@@ -126,7 +126,7 @@ def slowly(found: MbapRequest, _: ModbusClient) -> bytes:
 
 async def test_busy_clients_share_the_time_slice_of_one_event_loop_cycle() -> None:
     """A stop may have to wait for one cycle, in which each client has a turn."""
-    share = modbus_clients.RoundShare()
+    share = modbus_server.RoundShare()
     clock = cast(ControlledLoop, asyncio.get_running_loop()).passing
     ports = [ModbusPort(slowly, lambda _: True, lambda: clock.now, share) for _ in range(2)]
     block = b"".join(request(number, 1, 3, 0, 1) for number in range(100))
@@ -136,12 +136,12 @@ async def test_busy_clients_share_the_time_slice_of_one_event_loop_cycle() -> No
     begun = clock.now
     for client, _ in clients:  # one round
         client._drain()
-    assert clock.now - begun < 60 * 2 * modbus_clients.SLICE_S / 3
+    assert clock.now - begun < 60 * 2 * modbus_server.SLICE_S / 3
     for client, transport in clients:
         while client._waiting:
             client._drain()
         assert transactions(transport.written) == list(range(100))
-    assert share.slice_s == modbus_clients.SLICE_S
+    assert share.slice_s == modbus_server.SLICE_S
 
 
 async def test_invalid_bytes_close_the_connection_after_earlier_requests_are_answered() -> None:
@@ -157,7 +157,7 @@ async def test_a_client_that_reads_no_answers_is_disconnected() -> None:
     port = port_of()
     client, transport = connected(port)
     client.pause_writing()
-    await asyncio.sleep(modbus_clients.STALLED_S - 0.1)
+    await asyncio.sleep(modbus_server.STALLED_S - 0.1)
     port.sweep()
     assert not transport.ended
     await asyncio.sleep(0.2)
@@ -167,7 +167,7 @@ async def test_a_client_that_reads_no_answers_is_disconnected() -> None:
     client, transport = connected(port)
     client.pause_writing()
     client.resume_writing()
-    await asyncio.sleep(modbus_clients.STALLED_S + 1)
+    await asyncio.sleep(modbus_server.STALLED_S + 1)
     port.sweep()
     assert not transport.ended
 
@@ -196,7 +196,7 @@ async def test_writes_start_on_arrival_and_in_their_order(is_stalled: bool) -> N
         client.pause_writing()
     client.data_received(reads(0, 500) + writes(500, 502))
     assert begun[:2] == [500, 501]
-    assert len(begun) == (2 if is_stalled else 2 + modbus_clients.SLICE)
+    assert len(begun) == (2 if is_stalled else 2 + modbus_server.SLICE)
     client.resume_writing()
     await asyncio.sleep(1)
     assert begun == transactions(transport.written) == [500, 501, *range(500)]
@@ -216,8 +216,8 @@ async def test_slow_answers_to_a_client_are_sent_in_turns(frames: Callable[[int,
 def test_number_of_requests_of_a_client_that_reads_no_answers_is_limited(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(modbus_clients, "MOST_UNTAKEN", 4096)
-    monkeypatch.setattr(modbus_clients, "MOST_BEHIND", 1000 * READ_SIZE)
+    monkeypatch.setattr(modbus_server, "MOST_UNTAKEN", 4096)
+    monkeypatch.setattr(modbus_server, "MOST_BEHIND", 1000 * READ_SIZE)
 
     async def main() -> None:
         begun = 0
@@ -234,7 +234,7 @@ def test_number_of_requests_of_a_client_that_reads_no_answers_is_limited(
         await asyncio.sleep(1)
         assert (begun, transport.is_reading) == (3000, True)
         kept = len(transport.written)
-        assert kept < modbus_clients.MOST_UNTAKEN + 500 * len(request(1, 1, 6, 0, 1))
+        assert kept < modbus_server.MOST_UNTAKEN + 500 * len(request(1, 1, 6, 0, 1))
         transport.taken = kept
         client.resume_writing()
         await asyncio.sleep(1)
@@ -248,7 +248,7 @@ def test_number_of_requests_of_a_client_that_reads_no_answers_is_limited(
 
 
 async def test_requests_beyond_the_queue_limit_are_answered_busy(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(modbus_clients, "MOST_BEHIND", 1000 * READ_SIZE)
+    monkeypatch.setattr(modbus_server, "MOST_BEHIND", 1000 * READ_SIZE)
     client, transport = connected(port_of())
     client.data_received(reads(0, 1002))
     await asyncio.sleep(1)
@@ -262,7 +262,7 @@ async def test_an_idle_client_is_disconnected_unless_it_waits_for_an_answer() ->
     port = port_of(lambda found, _: never if found.transaction == 9 else found.reply(b""))
     connections = [connected(port) for _ in range(3)]
     connections[1][0].data_received(request(9, 1, 3, 0, 1))
-    await asyncio.sleep(modbus_clients.IDLE_S - 1)
+    await asyncio.sleep(modbus_server.IDLE_S - 1)
     connections[2][0].data_received(request(1, 1, 3, 0, 1))
     await asyncio.sleep(2)
     port.sweep()
@@ -273,16 +273,16 @@ async def test_an_idle_client_is_disconnected_unless_it_waits_for_an_answer() ->
 async def test_a_client_beyond_the_limit_replaces_the_client_that_is_idle_longest() -> None:
     port = port_of()
     found = []
-    for _ in range(modbus_clients.MOST_CLIENTS):
+    for _ in range(modbus_server.MOST_CLIENTS):
         found.append(connected(port)[1])
         await asyncio.sleep(0.1)
     refused = connected(port)[1]
     # refused instead of replacing another, because no other client was idle for 10 s
     assert refused.ended == "aborted"
-    await asyncio.sleep(modbus_clients.FORGETTABLE_S - 6.35)
+    await asyncio.sleep(modbus_server.FORGETTABLE_S - 6.35)
     assert not connected(port)[1].ended
     assert [transport.ended for transport in found[:2]] == ["aborted", ""]
-    assert len(port.clients) == modbus_clients.MOST_CLIENTS
+    assert len(port.clients) == modbus_server.MOST_CLIENTS
     assert port.refused == 1
 
 
