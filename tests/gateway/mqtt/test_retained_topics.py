@@ -271,7 +271,7 @@ def test_the_gateway_publishes_or_subscribes_each_topic_of_the_node_red_flow(tmp
     topics.outbox = noted = Noted()
     topics.connected()
     topics._report("pump-1", "stop", CommandResult(CommandOutcome.DONE, "stopped"), "id")
-    published = [*noted.topics, "multidrop/pump-1/rows"]  # test_sparkplug_node.py tests the topic of rows
+    published = [*noted.topics, "multidrop/pump-1/rows"]  # test_sparkplug.py tests the topic of rows
     taken = [topic for topic, _ in topics.topics()]
     assert len(topics_of("mqtt in")) == 4
     for topic in topics_of("mqtt in"):

@@ -14,7 +14,7 @@ from multidrop.gateway.metrics import counter
 from multidrop.gateway.mqtt.broker import Broker, parse_broker
 from multidrop.gateway.mqtt.json_topics import JsonTopics
 from multidrop.gateway.mqtt.settings import MqttSettings
-from multidrop.gateway.mqtt.sparkplug_node import SparkplugNode
+from multidrop.gateway.mqtt.sparkplug import SparkplugNode
 from multidrop.gateway.parts import PartContext
 from multidrop.supervisor import supervisor
 

@@ -23,7 +23,7 @@ from multidrop.gateway.forward.forwarder import (
 from multidrop.gateway.live.hub import published_value
 from multidrop.gateway.mqtt.broker import Address, Broker, Login, make_client
 from multidrop.gateway.mqtt.settings import MqttSettings
-from multidrop.gateway.mqtt.sparkplug_node import PastValue, SparkplugNode
+from multidrop.gateway.mqtt.sparkplug import PastValue, SparkplugNode
 from multidrop.gateway.parts import PartContext
 from multidrop.samples import unit_of
 

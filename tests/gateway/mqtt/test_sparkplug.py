@@ -25,8 +25,15 @@ from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout
 from multidrop.gateway.mqtt.broker import Outbox, Publication
 from multidrop.gateway.mqtt.part import build
 from multidrop.gateway.mqtt.settings import MqttSettings
-from multidrop.gateway.mqtt.sparkplug import DataType, Metric, ReceivedMetric, payload, read_command
-from multidrop.gateway.mqtt.sparkplug_node import STOP, SparkplugNode
+from multidrop.gateway.mqtt.sparkplug import (
+    STOP,
+    DataType,
+    Metric,
+    ReceivedMetric,
+    SparkplugNode,
+    payload,
+    read_command,
+)
 from multidrop.polling.batch import Batch
 
 
