@@ -5,13 +5,19 @@ from __future__ import annotations
 import re
 import time
 from itertools import pairwise
+from pathlib import Path
+from statistics import median
 from typing import Any
 
 import fake_gateway
 import fake_plant
 import pytest
 from fake_gateway import FakeGateway
+from gateways import served
+from lines import until as until_here
 from watching import LIVE, STALE, Opener, aborting, await_new_value, cell, link, until, until_met
+
+from multidrop.gateway.http.rights import Right
 
 pytestmark = pytest.mark.long
 
@@ -337,3 +343,51 @@ def check_row_on_a_phone(page: Any, name: str) -> None:
     assert missed.is_visible() is (share is not None)
     if share:
         assert missed.inner_text().replace("\n", "") == share
+
+
+# ---- with a real gateway that polls simulated drives ----
+
+
+def test_the_web_page_shows_a_polled_plant_and_stops_it_with_a_token(page: Any, tmp_path: Path) -> None:
+    with served(tmp_path) as gateway:
+        page.goto(f"http://localhost:{gateway.gateway.port}/")
+        until(page, LIVE)
+        assert page.locator("tr.drive").count() == 2
+        until(page, "document.querySelectorAll('tr.drive.stands').length === 2")
+        until_met(page, lambda: cell(page, "pump-1", "frequency").inner_text().strip() == "0.00Hz")
+        for view, text in (("lines", "Line time used"), ("faults", "Active: 0"), ("log", "No writes yet.")):
+            page.evaluate("view => { location.hash = `#/${view}` }", view)
+            page.locator(f"#{view}").get_by_text(text).first.wait_for()
+        page.keyboard.press("Shift+S")
+        page.get_by_role("button", name="Stop all 2 drives").click()
+        page.get_by_label("Token").fill(gateway.secrets[Right.STOP])
+        page.get_by_role("button", name="Sign in and send").click()
+        page.get_by_role("heading", name="All 2 drives are stopped", exact=True).wait_for()
+        until(page, "document.querySelector('#role').textContent === 'may stop'")
+        page.keyboard.press("Escape")
+        until_here(lambda: gateway.get("/api/audit").json["entries"])
+        page.evaluate("location.hash = '#/drives'")
+        page.evaluate("location.hash = '#/log'")
+        page.locator("#log-list tbody tr").first.wait_for()
+
+
+def test_the_delay_of_values_over_a_network_of_8_kb_a_second_does_not_grow(page: Any, tmp_path: Path) -> None:
+    """`python -m bench.questions.gateway.page` measures the delay itself."""
+    with served(tmp_path, "", *(f"drive-{n}" for n in range(1, 13))) as gateway:
+        page.goto(f"http://localhost:{gateway.gateway.port}/")
+        until(page, LIVE)
+        network = page.context.new_cdp_session(page)
+        network.send("Network.enable")
+        limits = {"latency": 0, "downloadThroughput": 8000, "uploadThroughput": 8000}
+        network.send("Network.emulateNetworkConditions", {"offline": False, **limits})
+        look = """import('/page/data/store.js').then(m => [m.store.frame.n, Date.now() - m.store.time])"""
+        seen = []
+        for _ in range(60):
+            seen.append(page.evaluate(look))
+            page.wait_for_timeout(100)
+        numbers, ages = zip(*seen, strict=True)
+        assert len(set(numbers)) > 5
+        assert list(numbers) == sorted(numbers)
+        until_met(page, lambda: page.evaluate(look)[1] < median(ages[10:30]) + 1000)
+        assert gateway.gateway.frames.viewers <= 1
+        until(page, LIVE)

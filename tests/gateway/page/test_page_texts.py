@@ -1,4 +1,4 @@
-"""Texts of the web page: each is in the catalogue, in all languages, with the same placeholders."""
+"""Files of the web page: texts are translated, scripts make no markup from texts, and no file is missing."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from multidrop.fleet.lines.member import MemberState
 from multidrop.gateway.http.files import PAGE, read_files
 from multidrop.gateway.http.rights import Right
 from multidrop.gateway.live import alarms, hub
+from multidrop.gateway.live.alarms import KINDS
 from multidrop.history.units import RAW
 
 LANGUAGES = {"ru", "zh"}
@@ -384,3 +385,75 @@ def test_composed_texts_of_the_gateway_are_translated_piece_by_piece(opened: Ope
         "constructor": "constructor",
     }
     assert page.evaluate(said, [*expected]) == [*expected.values()]
+
+
+# ---- all files of the page ----
+
+FILES = {path.relative_to(PAGE).as_posix(): path for path in sorted(PAGE.rglob("*")) if path.is_file()}
+OURS = [
+    path
+    for name, path in FILES.items()
+    if path.suffix in (".js", ".css", ".html") and not name.startswith("vendor/")
+]
+MARKUP = r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|createContextualFragment|DOMParser|srcdoc"
+CODE = r"\beval\(|new Function|javascript:|setAttribute\(\s*[\"']style|cssText"
+
+
+def test_page_scripts_use_no_function_that_makes_markup_or_code_from_text() -> None:
+    for name, script in SCRIPTS.items():
+        assert re.findall(f"{MARKUP}|{CODE}", script) == [], name
+
+
+def test_the_html_has_no_inline_style_script_or_event_handler() -> None:
+    html = (PAGE / "index.html").read_text("utf-8")
+    assert re.findall(r"\sstyle\s*=|<style|\son\w+\s*=|<script(?![^>]*\ssrc=)|https?://|data:", html) == []
+
+
+def test_page_files_are_short_and_start_with_a_comment() -> None:
+    for path in OURS:
+        lines = path.read_text("utf-8").splitlines()
+        assert len(lines) <= 600, path.name
+        assert max(map(len, lines)) <= 110 or path.suffix == ".html", path.name
+        assert path.suffix == ".html" or re.match(r"// [A-Z]|/\* [A-Z]", lines[0]), path.name
+
+
+def test_the_web_page_refers_to_all_its_files_and_to_no_others() -> None:
+    named = set(re.findall(r'"page/([\w./-]+)"', (PAGE / "index.html").read_text("utf-8")))
+    for name, script in SCRIPTS.items():
+        imports = re.findall(r'from "(\.[\w./-]+)"', script)
+        folder = (PAGE / name).parent
+        named |= {(folder / path).resolve().relative_to(PAGE.resolve()).as_posix() for path in imports}
+    there = FILES.keys()
+    # files for Prometheus and Grafana, which the page does not use
+    served = {"prometheus/alerts.yml", "prometheus/dashboard.json"}
+    assert there - named == {"index.html", "texts.toml", "vendor/uPlot-LICENSE", *served}
+    assert named - there == set()
+
+
+def test_each_kind_of_alarm_has_its_shape_colour_word_and_trend_bar() -> None:
+    index, strip, lanes, table, bars, words = (
+        (PAGE / name).read_text("utf-8")
+        for name in (
+            "index.html",
+            "style/top.css",
+            "style/plots.css",
+            "style/views.css",
+            "views/trends/lane.js",
+            "ui/values.js",
+        )
+    )
+    for kind in KINDS:
+        assert f'id="glyph-{kind}"' in index
+        assert f".strip .{kind}" in strip
+        assert f".lane .{kind}" in lanes
+        assert f".faults tr.{kind} .kind" in table
+        assert f'"{kind}"' in bars
+        assert f"\n  {kind}: " in words[words.index("ALARMS") :]
+
+
+def test_vendored_plot_library_has_its_licence() -> None:
+    licence = (PAGE / "vendor" / "uPlot-LICENSE").read_text("utf-8")
+    script = (PAGE / "vendor" / "uPlot.iife.min.js").read_text("utf-8")
+    assert "The MIT License" in licence
+    assert "Leon Sorokin" in licence
+    assert "(v1.6.32)" in script[:80]
