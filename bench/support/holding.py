@@ -10,8 +10,7 @@ from typing import Any
 from multidrop.drive import Drive
 from multidrop.drive.declaration_check import DeclarationError
 from multidrop.drive.register import Access, Register
-from multidrop.importers.device import ONLY_WRITTEN, ImportedDevice, ImportedRegister
-from multidrop.importers.family_writer import declare
+from multidrop.importers.device import ONLY_WRITTEN, ImportedDevice, ImportedRegister, declare
 
 DETAILS = {  # properties that an entry may need: their names in the printed table
     "offset": "offset",

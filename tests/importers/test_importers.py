@@ -30,9 +30,9 @@ from tables import table
 
 from multidrop import NoValue, load_family
 from multidrop.drive.register import Access, Register
-from multidrop.importers import family_text, family_writer, plant_text, read_devices
-from multidrop.importers.device import ImportedDevice, ImportedRegister
-from multidrop.importers.family_writer import declare
+from multidrop.importers import device as imported_device
+from multidrop.importers import family_text, plant_text, read_devices
+from multidrop.importers.device import ImportedDevice, ImportedRegister, declare
 from multidrop.sim import SimulatedDrive
 
 
@@ -300,8 +300,8 @@ def test_registers_above_the_limit_are_reported(tmp_path: Path, monkeypatch: pyt
         declared.append(found.name)
         return declare(found)
 
-    monkeypatch.setattr(family_writer, "MOST_REGISTERS", 2)
-    monkeypatch.setattr(family_writer, "declare", noted)
+    monkeypatch.setattr(imported_device, "MOST_REGISTERS", 2)
+    monkeypatch.setattr(imported_device, "declare", noted)
     rows = "".join(f"r{address},{address},uint16\n" for address in (1, 99_999, 2, 3, 4))
     device = only(tmp_path, "a.csv", f"name,address,type\n{rows}")
     assert [register.name for register in device.registers] == ["r1", "r2"]

@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from multidrop.importers.csv_tables import read_table
-from multidrop.importers.device import ImportedDevice
+from multidrop.importers.device import ImportedDevice, drop_undeclarable, family_text, plant_text
 from multidrop.importers.esphome import is_esphome, read_esphome
-from multidrop.importers.family_writer import drop_undeclarable, family_text, plant_text
 from multidrop.importers.home_assistant import read_home_assistant
 from multidrop.importers.parsing import parse_yaml
 from multidrop.importers.sunspec import is_sunspec, read_sunspec
