@@ -65,7 +65,7 @@ def by_test_frame(tree: Path, path: str) -> str | None:
 
 
 def by_test_schedule(tree: Path, path: str) -> str | None:
-    return _pytest(tree, "tests/planning/test_schedule.py", "tests/polling/test_least_interval.py")
+    return _pytest(tree, "tests/planning/test_schedule.py", "tests/polling/test_slow_drives.py")
 
 
 TRIALS: dict[str, tuple[Trial, ...]] = {
