@@ -27,9 +27,9 @@ from multidrop.families.innovert_ibd import IBDControl
 from multidrop.plant.model import Plant, PlantLine, PolledDrive
 from multidrop.poller import Poller
 from multidrop.sim import EncodedDrive, SimulatedDrive, Simulator, Wire, simulated
-from multidrop.transport import peers
+from multidrop.transport import drive_records
+from multidrop.transport.drive_records import make_exchange
 from multidrop.transport.exchange import READ_ATTEMPTS
-from multidrop.transport.prepared import make_exchange
 
 
 class Rig(Drive):
@@ -318,7 +318,7 @@ def test_an_invalid_argument_raises_before_any_frame_is_sent() -> None:
 @pytest.fixture
 def half_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
     """Wait half a second for each reply of a fast drive, because the computer may be busy."""
-    monkeypatch.setattr(peers, "LEAST_TIMEOUT", 0.5)
+    monkeypatch.setattr(drive_records, "LEAST_TIMEOUT", 0.5)
     monkeypatch.setattr(Rig, "response_timeout", 0.5)
 
 

@@ -24,7 +24,7 @@ from multidrop.errors import BusError, CheckAgain, PortLost
 from multidrop.families import YD1000, DelixiModbus
 from multidrop.families.invt_che import CHEControl
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
-from multidrop.transport import clock, peers
+from multidrop.transport import clock, drive_records
 
 GOODRIVE = 0x010A  # device code of another INVT series; an INVT CHE has 0101H
 GOODRIVE_DEVICE = 0x2103  # register of the device code in a Goodrive (Goodrive200A manual p. 140)
@@ -39,7 +39,7 @@ def known(model: str) -> Iterator[tuple[Bus, Any, ReceivedRequests]]:
     sim.motor.acceleration_time = sim.motor.deceleration_time = 0.1
     received = ReceivedRequests(sim)
     with (
-        patch.object(peers, "LEAST_TIMEOUT", 1.0),  # s, long enough for a busy computer
+        patch.object(drive_records, "LEAST_TIMEOUT", 1.0),  # s, long enough for a busy computer
         Simulator([Wire([sim], unpaced=True)]) as simulator,
         Bus(simulator.wires[0].path) as bus,
     ):

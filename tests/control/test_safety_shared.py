@@ -38,7 +38,7 @@ from multidrop.plant.model import PolledDrive
 from multidrop.poller import Poller
 from multidrop.polling.batch import Row
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
-from multidrop.transport import peers
+from multidrop.transport import drive_records
 
 SLOT = 2e-3  # s; frames within one slot collide
 
@@ -273,7 +273,7 @@ PATIENCE = 0.1  # s; the shortest timeout that is long enough on a busy computer
 
 @pytest.fixture
 def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(peers, "LEAST_TIMEOUT", PATIENCE)
+    monkeypatch.setattr(drive_records, "LEAST_TIMEOUT", PATIENCE)
 
 
 patient = pytest.mark.usefixtures("_patient")

@@ -26,7 +26,7 @@ from multidrop.core import Exchange, Failure, Framing, Message, Peer, build_repl
 from multidrop.drive import Drive
 from multidrop.planning.blocks import blocks
 from multidrop.sim import EncodedDrive, Faults, SimulatedDrive, Simulator, Wire, simulated
-from multidrop.transport import peers
+from multidrop.transport import drive_records
 
 __all__ = ["drive", "line"]  # fixtures
 
@@ -382,7 +382,7 @@ def test_a_new_pseudo_terminal_with_a_used_number_has_another_identity() -> None
     def made() -> set[str]:
         ours, theirs = os.openpty()
         try:
-            return peers.identities_of(os.ttyname(theirs))
+            return drive_records.identities_of(os.ttyname(theirs))
         finally:
             os.close(theirs)
             os.close(ours)
@@ -395,20 +395,20 @@ def test_a_new_pseudo_terminal_with_a_used_number_has_another_identity() -> None
 def test_a_drive_without_late_replies_is_not_remembered(wire: HoldingWire) -> None:
     with Bus(wire.path) as bus:
         bus.attach(QuickToy, 1).read(QuickToy.output_current)
-    assert not peers.identities_of(wire.path) & peers._former.keys()
+    assert not drive_records.identities_of(wire.path) & drive_records._former.keys()
 
 
 def test_a_drive_is_remembered_exactly_as_long_as_late_replies_are_expected(
     wire: HoldingWire, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     leave_a_reply_behind(wire, wire.path)
-    names = peers.identities_of(wire.path)
-    assert names <= peers._former.keys()
-    now_ns = peers.clock.now_ns
-    later: Callable[[], int] = lambda: now_ns() + peers.KEPT_NS  # noqa: E731
-    monkeypatch.setattr(peers.clock, "now_ns", later)
-    peers.remember_former_peers(["elsewhere"], [])
-    assert not names & peers._former.keys()
+    names = drive_records.identities_of(wire.path)
+    assert names <= drive_records._former.keys()
+    now_ns = drive_records.clock.now_ns
+    later: Callable[[], int] = lambda: now_ns() + drive_records.KEPT_NS  # noqa: E731
+    monkeypatch.setattr(drive_records.clock, "now_ns", later)
+    drive_records.remember_former_peers(["elsewhere"], [])
+    assert not names & drive_records._former.keys()
 
 
 BEGIN = 1000.0  # s; start of the simulated clock

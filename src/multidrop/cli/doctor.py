@@ -62,11 +62,10 @@ from multidrop.errors import LineError
 from multidrop.families.registry import find_model
 from multidrop.planning.blocks import first_block
 from multidrop.plant.model import Plant
+from multidrop.transport.drive_records import LEAST_TIMEOUT, make_exchange
 from multidrop.transport.line import Line
 from multidrop.transport.network_port import mixed_up, other_port, spoken_on
-from multidrop.transport.peers import LEAST_TIMEOUT
 from multidrop.transport.port_identity import lasting_name
-from multidrop.transport.prepared import make_exchange
 
 WAKE_S = 5.0  # how long to measure this computer's wake-ups, in s
 NOBODY = 247  # address at which no drive is expected: only an echo of the request may come back

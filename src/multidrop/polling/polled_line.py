@@ -22,7 +22,7 @@ from multidrop.plant.model import PlantLine, PolledDrive
 from multidrop.polling.jobs import JobMaker, PlannedJobs, PolledJob, PortQueue, RowNames, Slot
 from multidrop.polling.refusals import Refusals
 from multidrop.transport import clock
-from multidrop.transport.peers import GONE_S
+from multidrop.transport.drive_records import GONE_S
 from multidrop.transport.statistics import Statistics, line_statistics
 
 _log = logging.getLogger("multidrop.polling")

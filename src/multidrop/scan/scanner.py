@@ -35,8 +35,8 @@ from multidrop.planning.blocks import blocks, text_blocks
 from multidrop.scan.findings import GUESS, Crowd, Finding, Found, Noise, Progress, Untried
 from multidrop.scan.plant_writer import candidate
 from multidrop.scan.sweep import Sweep
+from multidrop.transport.drive_records import LEAST_TIMEOUT
 from multidrop.transport.exchange import good_reply
-from multidrop.transport.peers import LEAST_TIMEOUT
 
 R = TypeVar("R")
 Ask = Callable[[Drive, Message], Message]  # sends a request; raises BusError unless a valid reply comes

@@ -16,7 +16,7 @@ from multidrop.drive.line_settings import Settings
 from multidrop.drive.register import Access, Carrier, Register, Table
 from multidrop.planning.blocks import Block
 from multidrop.planning.bus_time import silence
-from multidrop.transport.peers import LEAST_TIMEOUT
+from multidrop.transport.drive_records import LEAST_TIMEOUT
 
 Setting = tuple[Settings, Framing]
 

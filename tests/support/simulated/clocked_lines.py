@@ -29,8 +29,8 @@ from multidrop.poller import Poller
 from multidrop.polling.batch import Row
 from multidrop.sim import FaultyWire
 from multidrop.sim import wire as wire_of_drives
-from multidrop.transport import clock, peers
-from multidrop.transport.prepared import NO_ROWS, make_exchange
+from multidrop.transport import clock, drive_records
+from multidrop.transport.drive_records import NO_ROWS, make_exchange
 
 S = 1_000_000_000
 BEGIN_NS = 1000 * S
@@ -322,7 +322,7 @@ class ClockedLines:
         self._beside: set[threading.Thread] = set()
         patch = self._patch = pytest.MonkeyPatch()
         patch.setattr(bus, "Line", self._line)
-        patch.setattr(peers, "_former", {})  # forget timing that was learnt on another clock
+        patch.setattr(drive_records, "_former", {})  # forget timing that was learnt on another clock
         patch.setattr(clock, "now_ns", lambda: self.now)
         patch.setattr(clock, "boottime_ns", lambda: self.now)
         patch.setattr(clock, "sleep", self._sleep)

@@ -13,7 +13,7 @@ from typing import Any
 
 from multidrop import bus
 from multidrop.core import Peer
-from multidrop.transport import peers
+from multidrop.transport import drive_records
 
 PATIENCE = 60.0  # s; each shorter timeout of the library is replaced by this one
 
@@ -25,7 +25,7 @@ def patient_peer(*, interval: float, **timeouts: float) -> Peer:
 
 def be_patient(set_attribute: Callable[..., None], set_item: Callable[..., None]) -> None:
     """Lengthen the timeouts of drives and writes, with functions like monkeypatch.setattr and .setitem."""
-    set_attribute(peers, "Peer", patient_peer)
+    set_attribute(drive_records, "Peer", patient_peer)
     await_turns(set_attribute, set_item)
 
 

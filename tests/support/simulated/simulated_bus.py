@@ -30,14 +30,14 @@ from multidrop.drive.verbs import verb
 from multidrop.errors import BusError
 from multidrop.families import InvtCHE
 from multidrop.sim import MotorDrive, SimulatedDrive, simulated
-from multidrop.transport import clock, peers
+from multidrop.transport import clock, drive_records
 
 EXCHANGE_TIME = 0.02  # duration of an exchange in s
 TIMEOUT = 0.3
 
 READING = {1, 2, 3, 4}
 # modules and names that a SimulatedBus replaces
-REPLACED = [(bus, "Line"), (peers, "_former")]
+REPLACED = [(bus, "Line"), (drive_records, "_former")]
 REPLACED += [(clock, name) for name in ("sleep", "now_ns", "boottime_ns", "utc_minus_monotonic_ns")]
 
 QUERYING = {3, 7}  # functions of Delixi's own protocol that only read

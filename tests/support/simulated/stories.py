@@ -25,7 +25,7 @@ from multidrop.plant.model import PolledDrive
 from multidrop.polling import polled_line
 from multidrop.polling.batch import Row
 from multidrop.sim import EncodedDrive, Faults, SimulatedDrive, simulated
-from multidrop.transport import clock, peers
+from multidrop.transport import clock, drive_records
 
 S = 1_000_000_000
 REGISTERS = 5  # polled registers per drive
@@ -281,7 +281,7 @@ def bus_over(
     wire.open()
     line = PathLine(wire)
     monkeypatch.setattr(bus, "Line", lambda port, *facts: line)
-    monkeypatch.setattr(peers, "_former", {})  # forget timing that was learnt on another clock
+    monkeypatch.setattr(drive_records, "_former", {})  # forget timing that was learnt on another clock
     monkeypatch.setattr(clock, "now_ns", lambda: line.now)
     monkeypatch.setattr(clock, "boottime_ns", lambda: line.now)
     monkeypatch.setattr(clock, "sleep", line.sleep)
