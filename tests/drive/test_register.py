@@ -149,7 +149,7 @@ def test_typed_text_is_parsed_to_a_value() -> None:
         Example.run.parse("go|stop")
 
 
-def test_words_is_the_number_of_addresses_that_a_register_occupies() -> None:
+def test_attribute_words_is_the_number_of_addresses_of_a_register() -> None:
     assert (Example.energy.words, Example.current.words, Example.coil.words) == (2, 1, 1)
 
 
@@ -359,7 +359,7 @@ class Known(Meter):
 
 
 @pytest.mark.parametrize("maker", ["ABB", "ABC"])
-def test_identify_of_a_drive_can_read_a_text_register(maker: str) -> None:
+def test_identity_check_of_a_drive_can_read_a_text_register(maker: str) -> None:
     sim = SimulatedDrive(Known(1))
     sim["maker"] = maker
     line = SimulatedBus(sim)

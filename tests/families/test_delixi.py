@@ -195,7 +195,7 @@ def test_delixi_state_at_0_hz_is_unknown() -> None:
     assert Wire(DelixiModbus(1), MODBUS_STANDING).drive.state().condition is Condition.UNKNOWN
 
 
-def test_delixi_identify_checks_address_and_baud_rate() -> None:
+def test_delixi_identity_check_compares_address_and_baud_rate() -> None:
     Wire(DelixiModbus(1), MODBUS_STANDING).drive.identify()
     for name, other, sentence in (
         ("fault", 99, "0063H"),
@@ -426,7 +426,7 @@ def test_delixi_native_state_shows_run_direction_and_fault(says: dict[str, objec
     assert Wire(DelixiNative(1), says).drive.state() == state
 
 
-def test_delixi_native_identify_reads_address_and_baud_rate() -> None:
+def test_delixi_native_identity_check_compares_address_and_baud_rate() -> None:
     wire = Wire(DelixiNative(1), NATIVE_STANDING)
     wire.drive.identify()
     assert (wire.reads, wire.sent) == (["address_setting", "baudrate_setting"], [])

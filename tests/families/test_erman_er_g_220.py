@@ -319,7 +319,7 @@ def test_erman_last_fault_with_only_unnamed_bits_counts_as_a_fault() -> None:
     assert wire.sent == []
 
 
-def test_erman_identify_refuses_the_models_03_and_04() -> None:
+def test_erman_models_03_and_04_fail_the_identity_check() -> None:
     Wire(ErmanERG220(1), STOPPED).drive.identify()
     with pytest.raises(WriteForbidden, match="0400H"):
         Wire(ErmanERG220(1), {"status": DriveException("drive", 1, "")}).drive.identify()

@@ -202,7 +202,7 @@ def test_innovert_ibd_start_needs_a_setup_and_no_fault(says: dict[str, object], 
     assert wire.sent == []
 
 
-def test_innovert_ibd_identify_needs_its_address_or_the_option_confirmed() -> None:
+def test_innovert_ibd_identity_check_needs_its_address_or_a_confirmation() -> None:
     says = {"baudrate_setting": IBDBaudrate.B9600, "address_setting": 1}
     Wire(InnovertIBD(1), says).drive.identify()
     for other in (

@@ -120,7 +120,7 @@ def parameters() -> list[tuple[str, ...]]:
     return [tuple(line.split()) for line in PARAMETERS.strip().splitlines()]
 
 
-def test_yd1000_registers_equal_the_typed_tables_of_sections_6_and_7() -> None:
+def test_yd1000_registers_equal_the_tables_of_sections_6_and_7() -> None:
     basic = "\n".join(f"03/06 {' '.join(row[:-2])}" for row in parameters())
     assert rows(YD1000) == typed(basic + OTHERS)
 
@@ -582,7 +582,7 @@ def test_yd1000_state_shows_a_turning_motor_or_a_fault() -> None:
     assert wire.drive.state().condition is Condition.STOPPED
 
 
-def test_yd1000_identify_checks_address_and_maximum_frequency() -> None:
+def test_yd1000_identity_check_compares_address_and_maximum_frequency() -> None:
     says = {"address_setting": 5.0, "maximum_frequency": 80.0}
     wire = Wire(YD1000(5), says)
     wire.drive.identify()

@@ -108,7 +108,7 @@ def test_unit_of_a_coil_in_a_csv_table_is_left_out_and_reported(tmp_path: Path) 
         ("scale", "x/10", None, "only its count is read: its scale 'x/10' or offset '' is not a number"),
     ],
 )
-def test_scale_column_with_several_meanings_is_marked_as_a_gap(
+def test_scale_column_with_several_meanings_is_reported(
     tmp_path: Path, header: str, cell: str, step: float | None, gap: str
 ) -> None:
     device = row(tmp_path, f"address,type,{header}", f"0x10,uint16,{cell}")
@@ -129,7 +129,7 @@ def test_scale_of_one_in_a_csv_table_does_not_hide_a_divisor(tmp_path: Path, one
     assert (entries(device)["a"], found(device)) == ({"at": 16, "step": 0.1}, [])
 
 
-def test_second_scale_column_of_a_csv_table_is_marked_as_a_gap(tmp_path: Path) -> None:
+def test_second_scale_column_of_a_csv_table_is_reported(tmp_path: Path) -> None:
     device = row(tmp_path, "address,type,scale,gain", "0x10,uint16,0.1,10")
     assert found(device) == ["its gain 10 was not carried over beside its scale"]
     device = row(tmp_path, "address,type,data type", "0x10,uint16,int32")
@@ -165,7 +165,7 @@ def test_order_of_offset_and_scale_in_a_csv_table_is_reported(tmp_path: Path) ->
         ("type,bit", "bool,3", None, ""),
     ],
 )
-def test_missing_number_type_in_a_csv_table_is_marked_as_a_gap(
+def test_missing_number_type_in_a_csv_table_is_reported(
     tmp_path: Path, header: str, cells: str, number_format: str | None, gap: str
 ) -> None:
     device = row(tmp_path, f"address,{header}", f"0x10,{cells}")
@@ -174,7 +174,7 @@ def test_missing_number_type_in_a_csv_table_is_marked_as_a_gap(
     assert said == ([gap] if gap else [])
 
 
-def test_ambiguous_length_of_a_text_in_a_csv_table_is_marked_as_a_gap(tmp_path: Path) -> None:
+def test_ambiguous_length_of_a_text_in_a_csv_table_is_reported(tmp_path: Path) -> None:
     device = row(tmp_path, "address,type,length", "0x10,string,8")
     assert found(device) == ["its length was taken for registers, and may be characters"]
     assert found(row(tmp_path, "address,type,registers", "0x10,string,8")) == []
@@ -194,7 +194,9 @@ def test_csv_register_of_three_words_without_a_type_is_not_imported(tmp_path: Pa
         ("", None, "the order of its words is not stated"),
     ],
 )
-def test_ambiguous_csv_byte_order_is_a_gap(tmp_path: Path, cell: str, order: str | None, gap: str) -> None:
+def test_ambiguous_byte_order_of_a_csv_table_is_reported(
+    tmp_path: Path, cell: str, order: str | None, gap: str
+) -> None:
     device = row(tmp_path, "address,type,byte order", f"0x10,uint32,{cell}")
     assert (entries(device)["a"].get("order"), found(device)) == (order, [gap] if gap else [])
 
@@ -273,7 +275,7 @@ def test_invalid_csv_table_raises_value_error_with_the_reason(tmp_path: Path, te
         only(tmp_path, "t.csv", text)
 
 
-def test_missing_modpoll_byte_order_defaults_to_be_le_and_is_marked_as_a_gap(tmp_path: Path) -> None:
+def test_missing_modpoll_byte_order_defaults_to_be_le_and_is_reported(tmp_path: Path) -> None:
     text = "device,m,1\npoll,holding_register,0,4,{}\nref,a,0,uint32,{},V,0.1{}\n"
     device = only(tmp_path, "m.csv", text.format("", "r", ""))
     assert entries(device)["a"]["order"] == "CDAB"

@@ -62,7 +62,7 @@ def test_esphome_entity_becomes_a_register(tmp_path: Path, keys: str, expected: 
         ("unit_of_measurement: '${unit}'", "its unit is ${unit}"),
     ],
 )
-def test_unsupported_esphome_filters_are_marked_as_gaps(tmp_path: Path, keys: str, gap: str) -> None:
+def test_unsupported_esphome_filters_are_reported(tmp_path: Path, keys: str, gap: str) -> None:
     assert gaps(entity(tmp_path, keys), "a") == [gap]
 
 
@@ -71,7 +71,7 @@ def test_multiply_of_an_esphome_number_becomes_a_divisor(tmp_path: Path) -> None
     assert entries(entity(tmp_path, "multiply: 10", "number"))["a"] == {"at": 5, "step": 0.1}
 
 
-def test_esphome_binary_sensor_with_several_mask_bits_is_marked_as_a_gap(tmp_path: Path) -> None:
+def test_esphome_binary_sensor_with_several_mask_bits_is_reported(tmp_path: Path) -> None:
     one = entity(tmp_path, "bitmask: 0x8", "binary_sensor")
     assert (entries(one)["a"], gaps(one, "a")) == ({"at": 5, "part": "3"}, [])
     several = entity(tmp_path, "bitmask: 0xC", "binary_sensor")
@@ -81,11 +81,11 @@ def test_esphome_binary_sensor_with_several_mask_bits_is_marked_as_a_gap(tmp_pat
     )
 
 
-def test_inverted_esphome_switch_is_marked_as_a_gap(tmp_path: Path) -> None:
+def test_inverted_esphome_switch_is_reported(tmp_path: Path) -> None:
     assert "inverted was not carried over" in gaps(entity(tmp_path, "inverted: true", "switch"), "a")
 
 
-def test_esphome_text_sensor_without_response_size_is_marked_as_a_gap(tmp_path: Path) -> None:
+def test_esphome_text_sensor_without_response_size_is_reported(tmp_path: Path) -> None:
     device = entity(tmp_path, "register_count: 4", "text_sensor")
     assert entries(device)["a"]["length"] == 4
     assert gaps(device, "a") == ["its response_size is not stated; 8 bytes were assumed"]

@@ -46,7 +46,7 @@ def test_home_assistant_width_may_be_given_by_count_or_structure(
     assert gaps(device, "a") == []
 
 
-def test_missing_or_contradictory_home_assistant_width_is_marked_as_a_gap(tmp_path: Path) -> None:
+def test_missing_or_contradictory_home_assistant_width_is_reported(tmp_path: Path) -> None:
     device = sensor(tmp_path, "data_type: float")
     assert entries(device)["a"]["number_format"] == "F16"
     assert "the width of its type float is not stated" in gaps(device, "a")[0]
@@ -81,12 +81,12 @@ def test_home_assistant_nan_value_is_parsed_as_hex_without_a_prefix(tmp_path: Pa
     assert entries(sensor(tmp_path, "nan_value: 8000"))["a"]["invalid"] == 8000
 
 
-def test_home_assistant_min_value_0_and_precision_0_are_marked_as_gaps(tmp_path: Path) -> None:
+def test_home_assistant_min_value_0_and_precision_0_are_reported(tmp_path: Path) -> None:
     assert gaps(sensor(tmp_path, "min_value: 0"), "a") == ["min_value was not carried over"]
     assert gaps(sensor(tmp_path, "precision: 0"), "a") == ["precision was not carried over"]
 
 
-def test_home_assistant_unit_given_as_a_secret_is_marked_as_a_gap(tmp_path: Path) -> None:
+def test_home_assistant_unit_given_as_a_secret_is_reported(tmp_path: Path) -> None:
     device = sensor(tmp_path, "unit_of_measurement: !secret unit")
     assert "unit" not in entries(device)["a"]
     assert gaps(device, "a") == ["its unit is !secret unit"]
@@ -113,7 +113,7 @@ def test_home_assistant_switch_is_read_at_its_verify_address(tmp_path: Path) -> 
     ]
 
 
-def test_brightness_and_colour_of_a_home_assistant_light_are_marked_as_gaps(tmp_path: Path) -> None:
+def test_brightness_and_colour_of_a_home_assistant_light_are_reported(tmp_path: Path) -> None:
     device = sensor(tmp_path, "brightness_address: 7, color_temp_address: 0", "lights")
     assert gaps(device, "a")[1:] == [
         "brightness_address was not carried over",

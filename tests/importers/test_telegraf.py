@@ -61,7 +61,7 @@ def test_telegraf_float64_is_not_imported_if_the_style_is_register(tmp_path: Pat
         of_registers(tmp_path, 'byte_order = "ABCD", data_type = "FLOAT64", address = [5, 6, 7, 8]')
 
 
-def test_missing_telegraf_type_and_output_type_are_marked_as_gaps(tmp_path: Path) -> None:
+def test_missing_telegraf_type_and_output_type_are_reported(tmp_path: Path) -> None:
     assert gaps(of_a_request(tmp_path, "address = 5"), "a") == ["its type is not stated; UINT16 was assumed"]
     device = of_a_request(tmp_path, 'address = 5, type = "INT16", scale = 0.1, output = "INT64"')
     assert gaps(device, "a") == ["output was not carried over"]

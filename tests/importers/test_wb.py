@@ -107,7 +107,7 @@ def test_bits_of_a_wb_mqtt_serial_register_are_imported_as_a_part_of_the_word(
     assert gaps(device, "a") == []
 
 
-def test_bits_across_three_wb_mqtt_serial_registers_are_marked_as_a_gap(tmp_path: Path) -> None:
+def test_bits_across_three_wb_mqtt_serial_registers_are_reported(tmp_path: Path) -> None:
     device = channel(tmp_path, address="5:30:4")
     assert gaps(device, "a") == ["only its count is read: its bits 30 to 33 of the format u16"]
 
@@ -149,15 +149,17 @@ def test_wb_mqtt_error_value_is_decoded_in_the_registers_format(
         ({"format": "bcd8"}, "its format bcd8 has fewer digits than its registers hold"),
     ],
 )
-def test_wb_mqtt_keys_that_are_not_imported_are_gaps(tmp_path: Path, keys: dict[str, Any], gap: str) -> None:
+def test_wb_mqtt_keys_that_are_not_imported_are_reported(
+    tmp_path: Path, keys: dict[str, Any], gap: str
+) -> None:
     assert gaps(channel(tmp_path, **keys), "a") == [gap]
 
 
-def test_wb_mqtt_text_without_its_size_is_marked_as_a_gap(tmp_path: Path) -> None:
+def test_wb_mqtt_text_without_its_size_is_reported(tmp_path: Path) -> None:
     assert gaps(channel(tmp_path, format="string8"), "a") == ["string_data_size is not stated; 1 was assumed"]
 
 
-def test_parts_of_a_composite_wb_mqtt_serial_channel_are_marked_as_gaps(tmp_path: Path) -> None:
+def test_parts_of_a_composite_wb_mqtt_serial_channel_are_reported(tmp_path: Path) -> None:
     parts = [{"reg_type": "input", "address": at} for at in (5, 7)]
     device = only(tmp_path, "w.json", {"device": {"channels": [{"name": "a", "consists_of": parts}]}})
     assert places(device) == [("a", 5), ("a_2", 7)]

@@ -199,7 +199,9 @@ def test_family_file_without_commands_needs_no_confirmation(plant: Path) -> None
         ("above = 5\nbelow = 7", 7, False),
     ],
 )
-def test_identify_section_recognises_drives(tmp_path: Path, proof: str, value: int, is_one: bool) -> None:
+def test_section_identify_of_a_family_file_recognises_drives(
+    tmp_path: Path, proof: str, value: int, is_one: bool
+) -> None:
     path = tmp_path / "meter.toml"
     head = '[family]\ntitle = "Meter"\nmanual = "M"\ncounts_from = 0\n[reading]\ndevice = { at = 3 }\n'
     path.write_text(f'{head}[[identify]]\nregister = "device"\n{proof}\n')

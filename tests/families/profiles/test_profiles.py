@@ -155,7 +155,7 @@ def identify(model: str, **says: Any) -> Wire:
 
 
 @table("model", WELL)
-def test_identify_accepts_a_drive_of_the_family(model: str) -> None:
+def test_identity_check_accepts_a_drive_of_the_family(model: str) -> None:
     wire = identify(model)
     assert set(wire.reads) == set(WELL[model])
     assert wire.sent == []
@@ -186,7 +186,9 @@ STRANGERS: list[tuple[str, dict[str, Any], str]] = [
 
 
 @table(("model", "says", "sentence"), STRANGERS)
-def test_identify_refuses_values_of_another_family(model: str, says: dict[str, Any], sentence: str) -> None:
+def test_identity_check_refuses_values_of_another_family(
+    model: str, says: dict[str, Any], sentence: str
+) -> None:
     with pytest.raises(WriteForbidden, match=sentence):
         identify(model, **says)
 
