@@ -43,7 +43,7 @@ class Sheet:
     after_reset: tuple[Word, ...] = ()  # writes after the reset
     write: int = 6
     shows_setpoint: int = 0  # address of a register that shows the setpoint; 0: there is none
-    # write -> register values that it causes
+    # register values that each write causes
     passes: Mapping[Word, Mapping[int, int]] = field(default_factory=dict)
     standing: Condition = Condition.STOPPED  # condition that the drive reports at rest
     failed: Condition = Condition.FAULT  # condition that the drive reports in a fault

@@ -44,8 +44,8 @@ SAME_WORDS = (
 SAME_STOP = {"invt-che", "invt-chf100a", "fuling-dzb"}
 
 AT_2000 = ("invt-goodrive", "powtran-pi130")
-# declared family -> families whose motor its stop word would run. The stop is not sent if the drive's
-# registers prove that it is of such a family. See docs/reference/profiles.md.
+# For each declared family, the families whose motor its stop word would run. The stop is not sent if the
+# drive's registers prove that it is of such a family. See docs/reference/profiles.md.
 RUNS_AT_A_STOP = {
     **dict.fromkeys(("innovert-ibd", "innovert-idd-mini-plus", "delixi-modbus"), AT_2000),
     **dict.fromkeys(("delta-vfd-el", "delta-ms300", "delta-cp2000"), AT_2000),

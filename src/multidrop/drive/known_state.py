@@ -44,13 +44,13 @@ class StateReader:
         if self._shown and all(values.get(name) == value for name, value in self._shown[0].items()):
             return self._shown[1]
         self.lacks = ""
-        notes, read = dict(vars(self._drive)), dict[str, float | None]()
-        found = self._look(values, read)
-        is_all_there_was = found is not None and notes == vars(self._drive)
-        self._shown = (read, found) if is_all_there_was else None
+        attributes, read = dict(vars(self._drive)), dict[str, float | None]()
+        found = self._computed(values, read)
+        depends_on_values_alone = found is not None and attributes == vars(self._drive)
+        self._shown = (read, found) if depends_on_values_alone else None
         return found
 
-    def _look(self, values: Mapping[str, float], read: dict[str, float | None]) -> State | None:
+    def _computed(self, values: Mapping[str, float], read: dict[str, float | None]) -> State | None:
         """Return the state, or None if a value is missing. Add the values that it depends on to `read`."""
         try:
             script = self._drive.state.script()
@@ -78,8 +78,10 @@ def _known(state: object, read: Mapping[str, float | None]) -> State | None:
 
     If the fault code is missing, a state with a fault is returned without the fault's name.
     """
-    if not isinstance(state, State) or read.get(FAULT, 0) is not None:
-        return state if isinstance(state, State) else None
+    if not isinstance(state, State):
+        return None
+    if read.get(FAULT, 0) is not None:
+        return state
     return State(Condition.FAULT) if state.condition is Condition.FAULT else None
 
 

@@ -56,8 +56,7 @@ class ParameterSpace:
     # codes of the drive's address, baud rate, format and protocol, in the order in which they are written
     line: tuple[str, ...] = ()
     passwords: tuple[str, ...] = ()
-    # codes that are never written -> reason
-    never: Mapping[str, str] = field(default_factory=dict)
+    never: Mapping[str, str] = field(default_factory=dict)  # reason for each code that is never written
     firmware: str = ""  # name of the register with the firmware version
 
     def codes(self, registers: Mapping[str, Register[Any]]) -> dict[str, tuple[int, Table]]:

@@ -190,8 +190,8 @@ VERBS = (
     *("release_control", "state"),
 )
 
-# verb -> name of its argument, allowed types, and their description in errors. Without the check of types,
-# the text "reverse" would run the motor forward.
+# Name of each verb's argument, its allowed types, and their description in errors. If the types were not
+# checked, the text "reverse" would run the motor forward.
 _TAKES: Mapping[str, tuple[str, tuple[type, ...], str]] = {
     "start": ("direction", (Direction, type(None)), "Direction.FORWARD or Direction.REVERSE"),
     "jog": ("direction", (Direction, type(None)), "Direction.FORWARD or Direction.REVERSE"),
@@ -398,7 +398,7 @@ def _hertz(value: object) -> float:
     return float(value)
 
 
-# verb -> its options, each with the function that converts a JSON value
+# options of each verb, with the functions that convert JSON values
 VERB_OPTIONS: Mapping[str, Mapping[str, Callable[[object], Any]]] = {
     "start": {"direction": _direction},
     "jog": {"direction": _direction},

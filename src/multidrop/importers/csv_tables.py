@@ -26,8 +26,8 @@ from multidrop.importers.parsing import (
     words_of,
 )
 
-# key of a register -> names of the CSV column for it, in lower case and without _. If several columns have
-# such names, the first name in the list wins.
+# names of the CSV column for each key of a register, in lower case and without _; if several columns have
+# such names, the first name in the list wins
 COLUMNS = {
     "name": (
         *("name", "register name", "signal name", "parameter name", "register", "description", "parameter"),
@@ -109,7 +109,7 @@ _WRITES = {5: "coil", 6: "holding", 15: "coil", 16: "holding"}
 _BARE_HEX = re.compile(r"(?=[0-9]*[a-fA-F])[0-9a-fA-F]{1,8}")
 # addresses such as 40001 or 400001: a digit for the table, then a number from 1
 _REFERENCE = re.compile(r"[0134][0-9]{4,5}")
-_ACCESS = {  # cell -> whether the register can be read, and whether it can be written
+_ACCESS = {  # for each text of a cell: whether the register can be read, and written
     **dict.fromkeys(("r", "ro", "read", "readonly", "rd"), (True, False)),
     **dict.fromkeys(("w", "wo", "write", "writeonly"), (False, True)),
     **dict.fromkeys(

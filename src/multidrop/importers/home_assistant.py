@@ -68,7 +68,7 @@ VERIFY_KEYS = key_table(imported="address input_type state_on state_off", irrele
 _DEFAULT_TABLES = {"sensors": "holding", "binary_sensors": "coil"}
 _NOT_READ = ("climates", "covers")
 _LEGACY_KINDS = {"sensor": "sensors", "binary_sensor": "binary_sensors", "switch": "switches"}
-# key of a list of entities -> their table; "": each entity states its table
+# table of the entities in each list; "": each entity states its table
 _LEGACY_LISTS = {"registers": "", "inputs": "", "coils": "coil"}
 MOST_REPEATED = 1000  # limit of the key virtual_count
 _DEEPEST = 4  # limit of packages within packages

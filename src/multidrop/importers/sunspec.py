@@ -44,7 +44,7 @@ def read_sunspec(document: Mapping[str, Any]) -> list[ImportedDevice]:
     device = ImportedDevice(title)
     reason = f"its place in the device is not in its file: {FIRST} is assumed, so mend every `at`"
     device.lose("the model", reason, is_entry=False)
-    names: dict[str, str] = {}  # point with a scale factor -> name of its register
+    names: dict[str, str] = {}  # register names of points that are scale factors
     address = FIRST
     for point in group["points"]:
         size, count = _size(point), whole(point, "count", 1)

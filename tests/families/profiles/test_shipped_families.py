@@ -29,7 +29,7 @@ every_family = table("name", SHIPPED)
 every_profile_family = table("name", OF_PROFILE)
 every_commanded_family = table("name", COMMANDED)
 
-# family -> short names of its manuals and of public programs. The `place` of each register starts with one.
+# Short names of each family's manuals and public programs. The `place` of each register starts with one.
 EDITIONS = {
     "abb-acs355": ("ACS355", "ACS550-02/U2", "ACS550-01", "ACS550 p. 209"),
     "danfoss-fc51": ("FC 51", "FC 101", "FC 202", "MG02A4", "MG02C6"),
