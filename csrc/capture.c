@@ -188,8 +188,8 @@ static void read_head(int framing, const uint8_t *bytes, size_t len, uint8_t hea
     int is_text = framing == MD_ASCII || framing == MD_DELIXI;
     size_t from = framing == MD_TCP ? MD_TCP_HEAD : 0;
     memset(head, 0, HEAD);
-    for (size_t i = 0; !is_text && i < HEAD && from + i < len; i++) /* memcpy() would be slower */
-        head[i] = bytes[from + i];
+    for (size_t i = from; !is_text && i < from + HEAD && i < len; i++) /* memcpy() would be slower */
+        head[i - from] = bytes[i];
     for (size_t i = 0; is_text && i < HEAD && 2 * i + 2 < len; i++) {
         int byte = md_hex_byte(bytes + 2 * i + 1);
         if (byte < 0)
@@ -268,12 +268,6 @@ static void pass(struct md_splitter *splitter, const struct md_span *span)
     splitter->awaited = span->message.address != 0 || span->framing == MD_TCP;
 }
 
-/* Return 1 if the capture says that these bytes are not a frame. */
-static int is_ruled_out(const struct md_piece *piece)
-{
-    return piece->side == MD_FAILED || piece->side == MD_NOISE;
-}
-
 /* Parse the frame at index `at`, which is in the splitter's piece. The next pause is before index `end`. */
 static int look_at(const struct md_splitter *splitter, const struct md_stream *stream, size_t at, size_t end,
                    struct md_span *span)
@@ -298,7 +292,8 @@ int md_split(struct md_splitter *splitter, const struct md_stream *stream, struc
             span->time_ns = pieces[splitter->piece].time_ns;
             span->side = pieces[splitter->piece].side;
         }
-        is_junk = is_ruled_out(&pieces[splitter->piece]);
+        int side = pieces[splitter->piece].side;
+        is_junk = side == MD_FAILED || side == MD_NOISE; /* the capture says that this is not a frame */
         if (is_junk)
             break;
         if (at >= end)

@@ -10,10 +10,10 @@
 
 /* Prefetch the memory that ports need for their next exchange while other ports are served.
  *
- * With many lines that memory has left the caches since the line's last exchange. Each exchange would wait
- * for it a dozen times: more than a third of the core's own time with 1024 lines, a tenth with 256. The
- * first byte of each object is read, because the processor drops a prefetch from a page without a cached
- * translation. */
+ * With many lines that memory has left the caches since the line's last exchange. Without prefetching, each
+ * exchange waits for it a dozen times: more than a third of the core's own time with 1024 lines, a tenth with
+ * 256. The first byte of each object is read, because the processor drops a prefetch if the page's address
+ * translation is not cached. */
 
 enum { CACHE_LINE = 64, STEPS_AHEAD = 4 };
 

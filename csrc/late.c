@@ -44,6 +44,7 @@ static int is_same(const struct md_owed *owed, const struct md_exchange *exchang
            memcmp(owed->data, request->data, data_kept(request)) == 0;
 }
 
+/* Return 1 unless the ranges of the two replies exclude each other: then their values differ. */
 static int may_hold_the_same(const struct md_owed *owed, const struct md_exchange *exchange)
 {
     return !owed->end || !exchange->end || (owed->least < exchange->end && exchange->least < owed->end);

@@ -128,9 +128,13 @@ static void check_stall(struct md_port *port)
 
 /* Return 1 until a stalled adapter has taken all bytes, and then until all replies to them must have come:
  * such a reply could be mistaken for the reply to the next read. A stop's reads do not wait for replies. */
-static int is_recovering(struct md_port *port, int64_t now_ns)
+static int must_recover(struct md_port *port, int64_t now_ns)
 {
-    const struct md_exchange *exchange = port->turn.line.exchange;
+    const struct md_line *line = &port->turn.line;
+    const struct md_exchange *exchange = line->exchange;
+    int was_wrong = port->doubts > 0 && port->doubts < MD_WRONG_COUNTS;
+    if (!port->turn.progress.stalled || now_ns - line->quiet_ns > md_line_hold_ns(line, was_wrong))
+        return 0;
     if (is_holding(port))
         port->taken_ns = MD_NEVER;
     else if (port->taken_ns == MD_NEVER)
@@ -138,14 +142,6 @@ static int is_recovering(struct md_port *port, int64_t now_ns)
     if (port->taken_ns == MD_NEVER)
         return 1;
     return !exchange->insists && now_ns - port->taken_ns < exchange->drive->most_timeout_ns;
-}
-
-static int must_recover(struct md_port *port, int64_t now_ns)
-{
-    const struct md_line *line = &port->turn.line;
-    int was_wrong = port->doubts > 0 && port->doubts < MD_WRONG_COUNTS;
-    return port->turn.progress.stalled && now_ns - line->quiet_ns <= md_line_hold_ns(line, was_wrong) &&
-           is_recovering(port, now_ns);
 }
 
 /* Return 1 if the request must wait until the adapter has taken earlier bytes. Otherwise a command could

@@ -16,9 +16,9 @@
 
 enum { MOST_LONE_COPIES = 2 }; /* copies accepted as replies before the next echo probe */
 
-/* An adapter may start to echo at any time. If a copy of the request confirms a write, the library also reads
- * the register back. If the reply to a read may equal its request, wait for the reply after the copy, unless
- * the copy is too late for an echo. */
+/* Even an adapter that is known not to echo may start to echo at any time. Then the echo of a read could be
+ * mistaken for its reply if both have the same length. The echo of a write does no harm: the library also
+ * reads the register back. */
 int md_echo_is_due(const struct md_line *line, int reply_len)
 {
     const struct md_exchange *exchange = line->exchange;
@@ -60,9 +60,10 @@ static int is_timely_copy(const struct md_line *line)
     return line->copy_by_ns && line->missing_ns >= line->copy_by_ns;
 }
 
-/* Learn from a reply whether the adapter echoes. A copy of the request before the reply shows an echo. Two
- * copies show one too, unless the adapter is known not to echo: then the reply may have come twice. A few
- * stray bytes before the reply show no echo. But if the adapter echoes, they may be the rest of one. */
+/* Learn from a reply whether the adapter echoes. A copy of the request before the reply is an echo. But if
+ * the reply itself equals the request, and the adapter is known not to echo, the reply may have come twice.
+ * Without a copy, the adapter does not echo. A few stray bytes before the reply do not change that, unless
+ * the adapter is known to echo: then they may be the rest of an echo. */
 static void learn_echo(struct md_line *line, size_t reply_at)
 {
     int is_copy = md_echo_is_copy(line, reply_at);
@@ -155,7 +156,9 @@ int md_reply_has_begun(const struct md_line *line)
     return line->rx_len > 0 && !(line->rx_len == line->tx_len && md_echo_is_copy(line, 0));
 }
 
-/* A reply comes character by character: wait for several characters before each read. */
+/* A reply comes character by character: wait for several characters before each read. Do not wait if the
+ * reply may be an exception, which is shorter. In the text of an ASCII frame an exception's function starts
+ * with '8' or a later digit. */
 void md_reply_foresee(struct md_line *line, int64_t now_ns)
 {
     const struct md_exchange *exchange = line->exchange;

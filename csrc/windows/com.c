@@ -180,9 +180,7 @@ int md_port_set(int fd, const struct md_settings *settings)
     return refused;
 }
 
-/* ---- the direction of a transceiver ---- */
-
-/* Switch an RS-485 transceiver by a COM port's RTS. */
+/* ---- the direction of an RS-485 transceiver, switched by RTS ---- */
 
 /* The driver raises RTS while it has bytes to send: Windows' own RS-485 mode. */
 int md_descriptor_take_rs485(int fd)

@@ -71,7 +71,8 @@ static struct md_file *find(int fd)
 
 /* ---- completions while the thread waits ---- */
 
-static void tell(struct md_file *file)
+/* Add the file to the list of ready files if it has bytes or a failure to report. */
+static void list_ready(struct md_file *file)
 {
     int has_news = file->is_held || file->is_ended || file->error;
     if (!has_news || !file->is_watched || file->is_ready)
@@ -88,7 +89,7 @@ void md_file_has_read(struct md_file *file, DWORD error, DWORD got)
     file->is_ended = !error && !got;
     if (error)
         file->error = md_errno_of(error);
-    tell(file);
+    list_ready(file);
 }
 
 void md_file_has_written(struct md_file *file, DWORD error)
@@ -96,7 +97,7 @@ void md_file_has_written(struct md_file *file, DWORD error)
     file->is_writing = 0;
     if (error)
         file->error = md_errno_of(error);
-    tell(file);
+    list_ready(file);
 }
 
 /* Start to read one byte ahead from the file, unless that byte has come or its read is in progress. */
@@ -204,7 +205,7 @@ void md_file_watch(int fd, int is_watched)
     if (!is_watched) /* the pending read causes one more wake-up; cancelling it would cost as much */
         return;
     begin(file);
-    tell(file);
+    list_ready(file);
 }
 
 static void unlist(const struct md_file *file)

@@ -78,9 +78,7 @@ int md_waiter_wait(struct md_waiter *waiter, void **ready, int room, int64_t tim
     return n;
 }
 
-/* ---- the wake-up ---- */
-
-/* An event by which any thread wakes the one that waits. */
+/* ---- the wake-up: an event with which any thread wakes the waiting thread ---- */
 
 int md_wakeup_make(struct md_wakeup *wakeup)
 {
