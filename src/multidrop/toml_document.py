@@ -1,13 +1,12 @@
-"""Read TOML files."""
+"""Read TOML files. If a text is not TOML, explain the mistake and its correction."""
 
 from __future__ import annotations
 
 import re
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
-
-from multidrop.toml_syntax import syntax_mistake
+from typing import Any, NamedTuple
 
 MOST_PARTS = 100  # most parts that a dotted key may have
 
@@ -99,3 +98,149 @@ def _fits(value: Any) -> bool:
     if isinstance(value, list):
         return all(map(_fits, value))
     return not isinstance(value, int) or -(2**63) <= value < 2**63
+
+
+# ---- explanations of mistakes ----
+
+
+MOST_SHOWN = 40  # limit of the shown characters of a line
+MOST_MATCHED = 1000  # limit of a line's characters: the time of some patterns grows with their square
+
+
+class _Cause(NamedTuple):
+    """A frequent mistake in TOML files, and its explanation."""
+
+    message: str  # regular expression for tomllib's message
+    line: str  # regular expression for the whole wrong line
+    # The explanation. It may contain groups of `line`, {rest} (the line from the wrong column on) and {first}
+    # (", first in line 5", if line 5 has the same key or header).
+    sentence: str
+
+
+_KEY = r"\s*(?P<key>[\w.\"'-]+)\s*"
+_END = r"\s*(#.*)?"
+_ITEM = r"(\"[^\"]*\"|[\w.-]+)"
+_WORD = r"(?P<value>[A-Za-z][\w .:/-]*?)\s*"
+_TWICE = "twice|overwrite|mutate"
+_VALUE = "Invalid value|Expected newline"
+_HEADER = "write [{key}] or [[{key}]]"
+_CAUSES = (
+    _Cause("", r".*\r.*", "a line ends with CR alone; save the file with the line ends LF or CRLF"),
+    _Cause(
+        _TWICE,
+        rf"\s*\[(?P<key>[^][]+)\]{_END}",
+        "[{key}] is there twice{first}; write its keys below one header, or write each header as [[{key}]]",
+    ),
+    _Cause(
+        _TWICE,
+        rf"\s*\[\[(?P<key>[^][]+)\]\]{_END}",
+        "[[{key}]] is also a single table{first}; write each of its headers in two brackets",
+    ),
+    _Cause(
+        _TWICE, rf"{_KEY}=.*", "{key} is there twice{first}; keep one, or start a new table with its header"
+    ),
+    _Cause(
+        r"character '\\n'|Expected '\"|Expected \"'|Unterminated", "", "a text is not closed; add a quote"
+    ),
+    _Cause("Illegal character", "", "a text has an invisible character; remove it"),
+    _Cause("", ".*[\u00a0\u200b\u2028\ufeff].*", "the line has an invisible character; write the line again"),
+    _Cause(
+        "[Uu]nescaped|escape|hex value", "", "a backslash in a text starts a code; write / or two of them"
+    ),
+    _Cause(
+        "",
+        r"[^=]*[=[,]\s*[\u201c\u201d\u201e\u201f\u2018\u2019\u201a\u00ab\u00bb].*",
+        'the line has typographic quotes; write them as in "text"',
+    ),
+    _Cause("Unclosed array", "", "a comma or a bracket is missing before {rest}"),
+    _Cause("Unclosed inline", "", "a comma or a brace is missing before {rest}"),
+    _Cause("initial", r"[^{]*\{[^}]*", "a table in braces is not closed; write the whole table in one line"),
+    _Cause("Invalid value", r".*,\s*,.*", "a comma is there twice; keep one"),
+    _Cause("", rf"{_KEY}:\s*(?P<value>.+)", "{key} has a colon; write {key} = {value}"),
+    _Cause("Invalid value", rf"{_KEY}={_END}", "{key} has no value; write one after the ="),
+    _Cause("", rf"\s*\[\[?\s*\]?{_END}", "a header has no name; write one in its brackets"),
+    _Cause(
+        "",
+        rf"\s*\[(\[)?\s*(?P<key>[^][#]*?)\s*(?(1)\]?){_END}",
+        f"a header lacks a bracket; {_HEADER}",
+    ),
+    _Cause(
+        "",
+        r"\s*(?=\[[^]]*\]\]|\[{3})\[+\s*(?P<key>[^][]*?)\s*(\].*)?",
+        f"a header has too many brackets; {_HEADER}",
+    ),
+    _Cause(
+        _VALUE,
+        rf"{_KEY}=\s*(?P<value>True|False|TRUE|FALSE){_END}",
+        "{value} is not a value; write {key} = true or {key} = false",
+    ),
+    _Cause(
+        _VALUE,
+        rf"{_KEY}=\s*(?P<whole>\d+),(?P<more>\d+){_END}",
+        "{whole},{more} has a decimal comma; write {key} = {whole}.{more}",
+    ),
+    _Cause(_VALUE, rf"{_KEY}=\s*0+(?P<value>\d+){_END}", "the number starts with 0; write {key} = {value}"),
+    _Cause(
+        _VALUE,
+        rf"{_KEY}=\s*[+-]?(\.\d+|\d+\.){_END}",
+        "the number has no digit on one side of its point; write {key} = 0.5 or {key} = 5.0",
+    ),
+    _Cause(
+        _VALUE,
+        rf"{_KEY}=\s*(?P<value>{_ITEM}(\s*,\s*{_ITEM})+),?{_END}",
+        "a list has no brackets; write {key} = [{value}]",
+    ),
+    _Cause(
+        _VALUE,
+        rf"{_KEY}=\s*(?P<value>yes|no|on|off|Yes|No|On|Off){_END}",
+        '{value} is not a value; write {key} = true, {key} = false or {key} = "{value}"',
+    ),
+    _Cause(
+        _VALUE,
+        rf"{_KEY}=\s*(?P<value>(?!\d+(\.\d+)?\s*(us|ms|s|min|h|days?)\b)\d[^\"'#=\[\]{{}}]*?){_END}",
+        '{value} is neither a number nor a text in quotes; write a number, or {key} = "{value}"',
+    ),
+    _Cause(
+        _VALUE,
+        rf"{_KEY}=\s*(?P<value>[^\"'\[{{\s#=][^\"'#=\[\]{{}}]*?){_END}",
+        '{value} has no quotes; write {key} = "{value}"',
+    ),
+    _Cause("Invalid value", rf".*[=[,]\s*{_WORD}[],}}].*", '{value} has no quotes; write "{value}"'),
+    _Cause("Expected newline", "", "{rest} does not belong here; write each key in its own line"),
+    _Cause(
+        "Expected '='|Invalid statement|initial",
+        r"(?:.*[{,])?\s*(?P<key>[^\s\"'=]*[^\x00-\x7f\s\"'=][^\s\"'=]*)\s*=.*",
+        'the key {key} has a letter other than a to z; write it in quotes: "{key}"',
+    ),
+    _Cause("Expected '='|Invalid statement", "", "the line is neither KEY = VALUE nor a [header]"),
+)
+
+
+def syntax_mistake(text: str, message: str) -> tuple[int, str]:
+    """Return the number of the wrong line, and a sentence about it; `message` is that of tomllib."""
+    lines = text.removesuffix("\n").split("\n")
+    # split at the last " (at ", because a key may have this text too
+    message, _, place = message.rpartition(" (at ")
+    number, column = map(int, re.findall(r"\d+", place) or (len(lines) + 1, 1))
+    rest = "the end of the file" if number > len(lines) else lines[number - 1][column - 1 :].strip()
+    number = min(number, len(lines))
+    wrong = lines[number - 1].rstrip("\r")[:MOST_MATCHED]
+    for cause in _CAUSES:
+        match = re.fullmatch(cause.line or ".*", wrong)
+        if match and re.search(cause.message, message):
+            facts = {name: _shown(part or "") for name, part in {**match.groupdict(), "rest": rest}.items()}
+            return number, cause.sentence.format(**facts, first=_first(lines[: number - 1], wrong))
+    return number, message
+
+
+def _shown(text: str) -> str:
+    return text if len(text) <= MOST_SHOWN else f"{text[:MOST_SHOWN]}..."
+
+
+def _first(above: Sequence[str], wrong: str) -> str:
+    """Return words that name the earlier line with the same key or header; "" if it is unknown."""
+    is_header = wrong.lstrip().startswith("[")
+    name = re.split("[]=]", wrong.strip(" \t["))[0].strip()
+    same = re.compile((r"\s*\[+\s*" if is_header else r"\s*") + re.escape(name) + r"\s*[]=]")
+    found = [number for number, line in enumerate(above, 1) if same.match(line)]
+    return f", first in line {found[0 if is_header else -1]}" if found else ""
