@@ -24,7 +24,7 @@ from recordings import ABOUT, record, row
 
 from multidrop.polling.batch import Row
 from multidrop.recording import RecordingError, convert, open_recording
-from multidrop.recording.phases import phase_row, with_phases
+from multidrop.recording.rows import phase_row, with_phases
 
 require_installed("asammdf")
 require_installed("h5py")

@@ -14,8 +14,7 @@ from multidrop.core import Names
 from multidrop.polling.added_rows import EVENT, TRIGGER, AddedRow, JoinedColumns
 from multidrop.polling.batch import Batch, status_code
 from multidrop.recording import convert, open_recording, open_writer
-from multidrop.recording.phases import phase_row, with_phases
-from multidrop.recording.rows import from_rows
+from multidrop.recording.rows import from_rows, phase_row, with_phases
 from multidrop.recording.triggered import MOST_OPEN, TriggeredWriter
 
 DRIVES, REGISTERS = Names(["pump-1", EVENT]), Names(["output_current", "trigger_1", TRIGGER])

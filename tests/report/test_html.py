@@ -18,8 +18,7 @@ from recordings import ABOUT, record, row
 
 from multidrop.polling.batch import Row
 from multidrop.recording import open_recording, open_writer
-from multidrop.recording.phases import phase_row, with_phases
-from multidrop.recording.rows import from_rows
+from multidrop.recording.rows import from_rows, phase_row, with_phases
 
 require_installed("matplotlib")
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from multidrop.polling.batch import ArrowTable, Rows, WideRows, schema, shown_span
-from multidrop.recording.phases import PhaseColumn, phase_names
+from multidrop.recording.rows import PhaseColumn, phase_names
 
 Metadata = Mapping[str, Any]
 MOST_SHOWN = 16 << 20  # largest file, in bytes, that a repr reads

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from multidrop.polling.added_rows import EVENT
 from multidrop.polling.batch import ROW_COLUMNS
 from multidrop.recording import open_recording
-from multidrop.recording.phases import PHASE_DRIVE, phase_names
+from multidrop.recording.rows import PHASE_DRIVE, phase_names
 from multidrop.recording.series import (
     LARGEST_COUNT,
     LATEST_NS,

@@ -13,7 +13,7 @@ from multidrop.drive.state import Direction
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import Plant
 from multidrop.printable import is_number
-from multidrop.recording.phases import PHASE_DRIVE
+from multidrop.recording.rows import PHASE_DRIVE
 from multidrop.runs.checks import check_frequency, check_start, check_stop, check_write, contradictions
 from multidrop.runs.model import EXAMPLE, AbortLimits, ReadingCondition, RunPlan, RunStep
 from multidrop.toml_check import DURATION, Key, TomlPlace, duration_of, grouped

@@ -28,7 +28,7 @@ from multidrop.plant.model import Plant, Polled, PolledDrive
 from multidrop.poller import Poller
 from multidrop.polling.batch import Rows, copied
 from multidrop.recording import RecordingWriter, open_writer
-from multidrop.recording.phases import phase_row, with_phases
+from multidrop.recording.rows import phase_row, with_phases
 from multidrop.runs.checks import RAMP_EVERY_S, check_step, misfits, silence_of
 from multidrop.runs.loader import STOP, load_test
 from multidrop.runs.model import LimitWatch, RunPlan, RunStep, timeline
