@@ -1,4 +1,4 @@
-"""Rows read from a recording, in Arrow's layout."""
+"""Rows read from a recording, in Arrow's layout, and the phases of a test run in a recording."""
 
 from __future__ import annotations
 
@@ -83,6 +83,12 @@ def _encoded(texts: Sequence[str]) -> tuple[array[int], bytes]:
     encoded = [text.encode() for text in texts]
     return array("i", [0, *accumulate(map(len, encoded))]), b"".join(encoded)
 
+
+# ---- phases of a test run ----
+
+# At the start of each step, a test run records a row. The row's drive is `test`, its register is `phase`, and
+# its value is a number. The metadata maps this number to the name of the step's phase. Tables made from such a
+# recording have a further column, `phase`, with the name of the phase in which a row's request was sent.
 
 PHASE_DRIVE, PHASE = "test", "phase"
 

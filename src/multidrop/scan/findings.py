@@ -1,4 +1,4 @@
-"""The findings of a scan: drives, problems and progress."""
+"""The findings of a scan: drives, problems and progress. Make a plant file of the drives."""
 
 from __future__ import annotations
 
@@ -79,6 +79,9 @@ class Progress:
 Finding = Found | Crowd | Noise | Untried | Progress
 
 
+# ---- the plant file ----
+
+
 def candidate(family: type[Drive], settings: Settings, framing: Framing, address: int) -> Drive | None:
     """Return a drive object of the family with these settings; None if its manual does not allow them.
 
@@ -102,8 +105,9 @@ def plant_text(
     rs485: RS485 = RS485.OFF,
     settle: float = 0.0,
 ) -> str:
-    """Return the plant file's text; `families` maps each model name in the plant file to its class.
+    """Return the text of a plant file with the found drives; doubts about a drive become comments.
 
+    `families` maps each model name in the plant file to its class.
     Raises ValueError if the scan found no drive of a known family.
     """
     names = {family.model or family.__name__: name for name, family in families.items()}
