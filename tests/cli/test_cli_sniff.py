@@ -23,7 +23,7 @@ from recordings import recorded
 from sniffing import sniffing, tapped
 
 from multidrop.capture import CaptureWriter, Side
-from multidrop.capture.pairing import Pairing
+from multidrop.capture.decoding import Pairing
 from multidrop.cli import sniff
 from multidrop.cli.sniff import Listener, TrafficPrinter
 from multidrop.core import Framing, Message, Splitter, Stream, build_reply, build_request

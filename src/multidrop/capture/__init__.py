@@ -20,10 +20,10 @@ A packet may hold a part of a frame, or several frames.
 from __future__ import annotations
 
 from multidrop.capture.decoding import Decoding as Decoding
-from multidrop.capture.pairing import Junk as Junk
-from multidrop.capture.pairing import Pairing as Pairing
-from multidrop.capture.pairing import Sniffed as Sniffed
-from multidrop.capture.pairing import SniffedExchange as SniffedExchange
+from multidrop.capture.decoding import Junk as Junk
+from multidrop.capture.decoding import Pairing as Pairing
+from multidrop.capture.decoding import Sniffed as Sniffed
+from multidrop.capture.decoding import SniffedExchange as SniffedExchange
 from multidrop.capture.pcapng import Capture as Capture
 from multidrop.capture.pcapng import CaptureError as CaptureError
 from multidrop.capture.pcapng import CaptureWriter as CaptureWriter

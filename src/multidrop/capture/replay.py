@@ -8,8 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from multidrop.capture.decoding import RegisterLookup, data_of, line_of
-from multidrop.capture.pairing import Pairing, Sniffed, SniffedExchange
+from multidrop.capture.decoding import Pairing, RegisterLookup, Sniffed, SniffedExchange, data_of, line_of
 from multidrop.capture.pcapng import Capture
 from multidrop.core import Message, Splitter
 from multidrop.drive.family import Drive
