@@ -87,8 +87,8 @@ def _encoded(texts: Sequence[str]) -> tuple[array[int], bytes]:
 # ---- phases of a test run ----
 
 # At the start of each step, a test run records a row. The row's drive is `test`, its register is `phase`, and
-# its value is a number. The metadata maps this number to the name of the step's phase. Tables made from such a
-# recording have a further column, `phase`, with the name of the phase in which a row's request was sent.
+# its value is a number. The metadata maps this number to the name of the step's phase. Tables made from such
+# a recording have a further column, `phase`, with the name of the phase in which a row's request was sent.
 
 PHASE_DRIVE, PHASE = "test", "phase"
 
