@@ -24,7 +24,7 @@ from peers import require_program
 from tables import table
 
 from multidrop import PlantError
-from multidrop.cli.schema import schema_of
+from multidrop.cli.completion import schema_of
 from multidrop.families.files import FamilyError
 from multidrop.families.files.loader import load_family
 from multidrop.gateway.settings import read_settings

@@ -26,7 +26,7 @@ _MISNAMED = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
 
 COMMANDS = {  # each command's module in this package, and its help text
     "demo": ("demo", "poll simulated drives on three lines, and run their motors"),
-    "schema": ("schema", "print the JSON Schema of a plant file, for editors"),
+    "schema": ("completion", "print the JSON Schema of a plant file, for editors"),
     "models": ("models", "list the families, or one family's registers"),
     "check": ("check", "check a family file or a plant file; opens no port"),
     "import": ("check", "convert another program's register table into a family file"),
