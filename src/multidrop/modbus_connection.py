@@ -25,8 +25,8 @@ from multidrop.errors import (
     NotVerified,
     Unconfirmed,
 )
-from multidrop.extras import install_command
 from multidrop.modbus_device import ModbusDevice
+from multidrop.printable import install_command
 from multidrop.transport.exchange import READ_ATTEMPTS
 
 try:

@@ -1,8 +1,9 @@
-"""Make texts from files and arguments safe to show, parse numbers, and suggest names for wrong ones."""
+"""Make texts safe to show, parse numbers, and make hints: similar names, commands that install libraries."""
 
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Iterable
 from typing import TypeGuard
 
@@ -84,3 +85,26 @@ def did_you_mean(name: str, known: Iterable[str], otherwise: str = "", most: int
     if near := nearest_names(name, known, most):
         return f"did you mean {' or '.join(near)}?"
     return otherwise or f"there are {', '.join(known) or 'none'}"
+
+
+def install_command(*extras: str) -> str:
+    """Return the pip command for the libraries of these extras.
+
+    The command names each library, because pip finds `multidrop[extra]` only in the directory of the sources.
+    The names of the extras follow as a shell comment.
+    """
+    # imported here, because most programs never need it
+    from importlib.metadata import PackageNotFoundError, requires
+
+    try:
+        found = [one.partition(";") for one in requires("multidrop") or ()]
+    except PackageNotFoundError:
+        found = []
+    markers = [f'extra == "{extra}"' for extra in extras]
+    wanted = [
+        name.strip()
+        for name, _, given in found
+        if any(marker in given.replace("'", '"') for marker in markers)
+    ]
+    named = f"multidrop[{','.join(extras)}]"
+    return f"pip install {shlex.join(wanted)}  # {named}" if wanted else f"pip install '{named}'"

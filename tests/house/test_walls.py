@@ -21,7 +21,7 @@ OUTSIDE = {
 }
 # packages by floor, the lowest floor first: a package may import only from lower floors
 FLOORS = [
-    {"errors", "exposition", "extras", "iso_time", "printable", "supervisor", "toml_document", "whole_file"},
+    {"errors", "exposition", "iso_time", "printable", "supervisor", "toml_document", "whole_file"},
     {"toml_check"},
     {"core"},
     {"drive"},
@@ -89,7 +89,6 @@ OPEN = {
         "samples.sample_tables",
         "errors",
         "exposition",
-        "extras",
         "iso_time",
         "printable",
         "supervisor",

@@ -25,10 +25,10 @@ from tables import table
 from toy import Toy
 
 from multidrop.core import Columns, Names, RowQueue, Status
-from multidrop.extras import install_command
 from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
 from multidrop.poller import Poller
 from multidrop.polling.batch import ROW_COLUMNS, Batch, Row
+from multidrop.printable import install_command
 from multidrop.recording.rows import from_rows
 from multidrop.sim import EncodedDrive, Simulator, Wire
 

@@ -19,9 +19,9 @@ from multidrop.cli.support.files import refuse_overwriting
 from multidrop.cli.support.output import command_line, print_text
 from multidrop.cli.support.terminal import keys_are_readable
 from multidrop.cli.support.values import aligned, counted
-from multidrop.extras import install_command
 from multidrop.plant.loader import load_plant
 from multidrop.poller import Poller
+from multidrop.printable import install_command
 from multidrop.recording import open_recording
 
 OUT, SECONDS = "demo.arrows", 8.0

@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 from multidrop import Plant
-from multidrop.extras import install_command
 from multidrop.gateway.commands import Commands
 from multidrop.gateway.http.rights import Tokens
 from multidrop.gateway.live.alarms import Alarms
 from multidrop.gateway.live.hub import Hub
+from multidrop.printable import install_command
 from multidrop.supervisor import supervisor
 
 BUILD_S = 3.0  # in s: how long a start or a reload waits for parts that are being built

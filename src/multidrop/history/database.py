@@ -10,9 +10,9 @@ from shutil import rmtree
 from tempfile import mkdtemp
 from typing import Any
 
-from multidrop.extras import install_command
 from multidrop.history.units import Series
 from multidrop.polling.batch import Rows, assemble, schema
+from multidrop.printable import install_command
 from multidrop.recording.format import METADATA_KEY, Metadata
 from multidrop.recording.rows import RecordedRows
 

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from importlib import import_module
 from typing import Any
 
-from multidrop.extras import install_command
+from multidrop.printable import install_command
 
 # ---- numbers ----
 

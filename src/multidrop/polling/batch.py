@@ -20,8 +20,7 @@ from typing import Any, NamedTuple, NoReturn
 from multidrop.channels import SlotRow
 from multidrop.core import STATUSES, Columns, Names, spell
 from multidrop.core.columns import COLUMNS, find_codes
-from multidrop.extras import install_command
-from multidrop.printable import did_you_mean
+from multidrop.printable import did_you_mean, install_command
 
 
 class ArrowTable(ABC):

@@ -54,7 +54,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from multidrop.extras import install_command
+from multidrop.printable import install_command
 from multidrop.recording.format import Metadata as Metadata
 from multidrop.recording.format import RecordingError as RecordingError
 from multidrop.recording.format import RecordingReader as RecordingReader

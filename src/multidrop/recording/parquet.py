@@ -12,8 +12,8 @@ from io import BufferedWriter
 from pathlib import Path
 from typing import Any
 
-from multidrop.extras import install_command
 from multidrop.polling.batch import Rows, nanoarrow, schema
+from multidrop.printable import install_command
 from multidrop.recording.format import (
     METADATA_KEY,
     Metadata,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 from pathlib import Path
 
-from multidrop.extras import install_command
+from multidrop.printable import install_command
 from multidrop.recording.format import AppendFile, already_there, new_file, writing
 
 

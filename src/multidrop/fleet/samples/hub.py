@@ -36,10 +36,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from multidrop.extras import install_command
 from multidrop.fleet.errors import FleetError
 from multidrop.fleet.samples.samples_stream import StreamInfo, StreamMessage, read_after, stream_info
 from multidrop.fleet.servers.connections import ServerPath
+from multidrop.printable import install_command
 from multidrop.recording import FileLock
 from multidrop.samples import ROWS, MessageError, SinkError, unpack
 from multidrop.whole_file import UNFINISHED, whole_file
