@@ -12,8 +12,7 @@ from pathlib import Path
 
 import pytest
 from batches import METADATA, counting
-from commands import TOY, Run
-from kills import BoundProcess
+from commands import TOY, BoundProcess, Run
 from tables import table
 
 from multidrop.cli import COMMANDS, main

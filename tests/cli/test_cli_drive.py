@@ -13,8 +13,7 @@ import time
 from pathlib import Path
 
 import pytest
-from commands import TOY, Run
-from kills import BoundProcess
+from commands import TOY, BoundProcess, Run
 from lines import Faulty, patient
 from simulated_bus import SimulatedBus
 from tables import table

@@ -15,9 +15,8 @@ from typing import Any, cast
 
 import pytest
 from batches import METADATA, counting
-from commands import Run, multidrop, plant_file, running
+from commands import BoundProcess, Run, multidrop, plant_file, running
 from examples import usually
-from kills import BoundProcess
 from lines import until
 from peers import require_module
 from recordings import recorded

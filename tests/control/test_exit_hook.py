@@ -12,8 +12,8 @@ from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import pytest
+from commands import BoundProcess
 from examples import usually
-from kills import BoundProcess
 from lines import PATIENCE, line, plant, polled, until
 from motors import ReceivedRequests
 

@@ -16,7 +16,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
-from kills import BoundProcess
+from commands import BoundProcess
 from lines import PATIENCE
 from simulated_bus import SimulatedBus, one
 from tables import table

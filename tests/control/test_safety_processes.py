@@ -14,8 +14,8 @@ from typing import Any
 
 import checksums
 import pytest
+from commands import BoundProcess
 from examples import usually
-from kills import BoundProcess
 from simulated_bus import SimulatedBus, is_write, one
 from tables import table
 

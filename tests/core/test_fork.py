@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 import toy
-from kills import BoundProcess
+from commands import BoundProcess
 from lines import PATIENCE, plant, polled, rows_of, until
 from lines import line as declared
 from ptys import SerialServer

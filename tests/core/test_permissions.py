@@ -18,8 +18,8 @@ from contextlib import contextmanager
 from typing import Any
 
 import pytest
+from commands import BoundProcess
 from fencing import Fence, Round
-from kills import BoundProcess
 from tables import table
 
 from multidrop.core import Mastership

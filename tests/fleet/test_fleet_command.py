@@ -16,11 +16,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from commands import MULTIDROP, Run
+from commands import MULTIDROP, BoundProcess, Run
 from examples import usually
 from fleets import plant_text
 from free_ports import free_ports
-from kills import BoundProcess
 from lines import PATIENCE, until
 from nats_clusters import Cluster, cluster, old_server_program
 from tables import table

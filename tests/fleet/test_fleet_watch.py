@@ -15,8 +15,7 @@ from typing import Any
 from unittest.mock import AsyncMock
 
 import pytest
-from commands import Run
-from kills import BoundProcess
+from commands import BoundProcess, Run
 from nats_clusters import Cluster
 from tables import table
 from terminals import on_terminal

@@ -15,9 +15,9 @@ from typing import Any
 import pyarrow as pa
 import pytest
 from brokers import Listener, has, mosquitto
+from commands import kill_all
 from fleets import HandClock, MemoryBucket
 from gateways import Served, running
-from kills import kill_all
 from lines import until
 from spooled import NOON, numbered
 from tables import table

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any, BinaryIO, NoReturn
 
 import pytest
+from commands import BoundProcess
 from gateways import Served, served, serving, simulated_plant
-from kills import BoundProcess
 from lines import PATIENCE, until
 
 from multidrop import History

@@ -15,10 +15,10 @@ from time import monotonic, sleep
 from typing import Any
 
 import pytest
+from commands import BoundProcess
 from examples import first_in_ci
 from gateways import simulated_plant
 from interruptions import every, interrupted_before
-from kills import BoundProcess
 from lines import PATIENCE, until
 
 from multidrop import Bus, InvtCHE, Plant

@@ -16,9 +16,9 @@ from typing import Any
 
 import pytest
 import yaml
+from commands import BoundProcess
 from free_ports import free_port
 from gateways import Served, served, serving
-from kills import BoundProcess
 from lines import PATIENCE, until
 from peers import require_program
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from commands import MULTIDROP, Run, multidrop
+from commands import MULTIDROP, BoundProcess, Run, multidrop
 from gateways import (
     Served,
     certificate,
@@ -31,7 +31,6 @@ from gateways import (
     tokens,
     written,
 )
-from kills import BoundProcess
 from lines import PATIENCE, until
 from tables import table
 

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import corpora
 import pytest
+from commands import BoundProcess
 from harness import HERE, command
-from kills import BoundProcess
 from lines import PATIENCE
 from mutation.edits import mutants
 from mutation.trials import core_files

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 from urllib.parse import urlsplit
 
 import pytest
-from kills import BoundProcess
+from commands import BoundProcess
 from lines import HOST_LATE, patient, rows_of, until
 from own_drives import ADDRESSES
 from peers import build_with_libmodbus, require_module, require_program

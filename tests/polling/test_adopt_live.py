@@ -13,8 +13,8 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from commands import descriptors, threads
 from examples import examples
-from kills import descriptors, threads
 from lines import PATIENCE, line, plant, polled, until
 from serial.urlhandler import protocol_socket
 from toy import QuickToy, Toy

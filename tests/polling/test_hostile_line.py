@@ -19,8 +19,8 @@ from typing import Any
 
 import pytest
 from clocked_lines import ClockedLines, ClockedWire
+from commands import descriptors, threads
 from examples import usually
-from kills import descriptors, threads
 from lines import LateWire, line, plant, polled, proofs, rows_of, served
 from motors import (
     LATEST,

@@ -22,7 +22,7 @@ from typing import Any
 import checksums
 import pytest
 from clocked_lines import ClockedLines, ClockedWire
-from kills import descriptors, threads
+from commands import descriptors, threads
 from lines import HOST_LATE, PATIENCE, Faulty, line, plant, polled, proofs, rows_of, until
 from serial import Serial
 from toy import Toy

@@ -18,9 +18,9 @@ import pyarrow as pa
 import pyarrow.parquet
 import pytest
 from batches import DRIVES, METADATA, REGISTERS, SECOND, UTC_0, add_rows, block, completion, counting, example
+from commands import BoundProcess
 from examples import examples, usually
 from interruptions import full_at, read_only_directory
-from kills import BoundProcess
 from recordings import recorded, rows_of
 from tables import table
 from toy import Toy

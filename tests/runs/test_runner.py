@@ -17,9 +17,8 @@ from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import pytest
-from commands import MULTIDROP
+from commands import MULTIDROP, BoundProcess
 from examples import first_in_ci
-from kills import BoundProcess
 from lines import patient, until
 from simulated_bus import is_write
 from simulated_pumps import CHE, STEPS, far_ends, simulated_test, turning, write_test

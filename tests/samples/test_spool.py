@@ -17,9 +17,9 @@ from typing import Any
 
 import pytest
 import spooled
+from commands import BoundProcess
 from examples import first_in_ci
 from interruptions import full_at, read_only_directory
-from kills import BoundProcess
 from lines import until
 from spooled import exchanges_in, numbered, rows_in, rows_of
 

@@ -18,7 +18,7 @@ from typing import Any
 
 import checksums
 import pytest
-from kills import descriptors, threads
+from commands import descriptors, threads
 from lines import Own, until
 from peers import require_module, require_program
 from ptys import opened, receive

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from kills import descriptors, threads
+from commands import descriptors, threads
 from lines import PATIENCE, line, plant, polled, rows_of, until
 from ptys import SerialServer, pyserials_own, vanishing_pty
 from serial import Serial

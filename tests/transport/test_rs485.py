@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
-from kills import descriptors, threads
+from commands import descriptors, threads
 from lines import line, plant, polled
 from peers import ROOT, preloaded
 from toy import Toy

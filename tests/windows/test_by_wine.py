@@ -19,7 +19,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
-from kills import BoundProcess
+from commands import BoundProcess
 from motors import ReceivedRequests
 
 from multidrop.families import InvtCHE

@@ -26,8 +26,8 @@ from contextlib import ExitStack
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from commands import BoundProcess
 from free_ports import free_ports
-from kills import BoundProcess
 from simulated_pumps import simulated_pumps, write_plant
 
 from bench.questions.gateway.costs import Worker

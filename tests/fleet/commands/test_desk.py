@@ -17,9 +17,9 @@ from typing import Any
 from unittest.mock import patch
 
 import pytest
+from commands import BoundProcess
 from examples import every_third
 from fleets import LINE, PATIENCE_S, Desks, desks
-from kills import BoundProcess
 from lines import PATIENCE, patient
 from tables import table
 

@@ -10,9 +10,9 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from commands import BoundProcess
 from fleets import MemoryBucket
 from free_ports import free_ports
-from kills import BoundProcess
 from nats_clusters import (
     Cluster,
     cluster,

@@ -19,8 +19,8 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from commands import BoundProcess
 from gateways import Served, served, written
-from kills import BoundProcess
 from lines import PATIENCE, until
 
 from multidrop import Plant, PlantError, PolledDrive

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 from unittest.mock import patch
 
-from kills import kill_all
+from commands import kill_all
 from namespaces import Namespace, network
 from nats_clusters import Cluster, Node, cluster
 from serial_hall import SerialHall

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 
 sys.path.extend(map(str, Path(__file__).parents[1].iterdir()))
 
-from kills import BoundProcess
+from commands import BoundProcess
 from simulated_pumps import FIRST_READING, POLLED, UNPOLLED
 
 VIEWERS, STALLED, MASTERS = 5, 10, 2

@@ -17,8 +17,7 @@ from typing import Any, NamedTuple
 
 import pytest
 import uvicorn.server
-from commands import MULTIDROP
-from kills import BoundProcess
+from commands import MULTIDROP, BoundProcess
 from lines import PATIENCE, until
 
 from multidrop import InvtCHE, Plant

@@ -1,15 +1,15 @@
-"""Run `multidrop` commands as users do, in separate processes."""
+"""Run `multidrop` commands as users do, in separate processes; kill processes; find leaked resources."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+import threading
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
-
-from kills import BoundProcess
+from types import TracebackType
+from typing import IO, Any, AnyStr
 
 from multidrop.families.registry import find_model
 
@@ -18,6 +18,17 @@ TOY = f"{Path(__file__).parents[1]}/drives/toy.py:Toy"
 find_model(TOY)  # load the file now, so that its log entry does not appear during a test
 Run = Callable[..., tuple[int, str, str]]
 TOY_IS_RUN = f"multidrop: {TOY.rpartition(':')[0]} is run as Python: a user's model is a program\n"
+
+
+class BoundProcess(subprocess.Popen[AnyStr]):
+    """A process that is killed if its `with` block fails, whereas `Popen` would wait for its end."""
+
+    def __exit__(
+        self, kind: type[BaseException] | None, failure: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if failure is not None:
+            self.kill()
+        super().__exit__(kind, failure, traceback)
 
 
 def multidrop(*words: object, most_bytes: int | None = None) -> subprocess.CompletedProcess[str]:
@@ -56,3 +67,24 @@ def plant_file(directory: Path, *, dead: bool = False) -> Path:
     path = directory / f"{'with-dead' if dead else 'living'}.toml"
     path.write_text(line + drive.format("pump-1", TOY, 1) + (drive.format("pump-9", TOY, 9) if dead else ""))
     return path
+
+
+# ---- killing and counting ----
+
+
+def kill_all(processes: Iterable[subprocess.Popen[Any]]) -> None:
+    """Kill processes, even suspended ones, and wait for their end."""
+    killed = list(processes)
+    for process in killed:
+        process.kill()
+    for process in killed:
+        process.wait()
+
+
+def descriptors() -> int:
+    return len(list(Path("/dev/fd").iterdir()))
+
+
+def threads() -> int:
+    """Return the number of threads, except the logging thread, which starts at the first log entry."""
+    return sum(thread.name != "multidrop log" for thread in threading.enumerate())

@@ -17,8 +17,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
-from commands import MULTIDROP
-from kills import BoundProcess
+from commands import MULTIDROP, BoundProcess
 from lines import until
 
 from multidrop.core import set_settings

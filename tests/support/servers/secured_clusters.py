@@ -14,9 +14,9 @@ from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from commands import kill_all
 from fleet_drills import CommandEnd, fleet_status, run_here
 from fleet_scale import until
-from kills import kill_all
 from nats_clusters import Cluster, Node, server_program, started_cluster
 from peers import require_program
 from serial_hall import SerialHall

@@ -25,8 +25,8 @@ from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 
 sys.path.extend(map(str, Path(__file__).parents[1].iterdir()))
 
+from commands import BoundProcess
 from free_ports import free_ports
-from kills import BoundProcess
 
 from multidrop import Plant
 from multidrop.families.profiles.command_codes import DeltaControl
