@@ -16,11 +16,11 @@ from typing import IO, Any
 
 import pytest
 from commands import Run
-from examples import examples
 from hypothesis import HealthCheck, settings
 from patient import await_turns, be_patient
 from peers import require_module
 from simulated_bus import real_clock
+from tables import examples
 
 from multidrop.cli import main
 

@@ -11,12 +11,11 @@ from pathlib import Path
 import checksums
 import pytest
 from captures import BEGIN, RTU, STEP, TEXT, decimal, rows, spans, tshark, write
-from examples import usually
 from frames import PRINTED
 from interruptions import full_at
 from lines import PATIENCE, until
 from peers import require_program
-from tables import table
+from tables import table, usually
 from toy import Toy
 
 from multidrop.capture import (

@@ -9,7 +9,7 @@ from pathlib import Path
 import checksums
 import pytest
 from captures import BEGIN, RTU, STEP, TEXT, rows, write
-from examples import usually
+from tables import usually
 
 from multidrop.capture import Capture, CaptureWriter, Decoding, Side
 from multidrop.core import Framing, Message, build_reply, build_request

@@ -16,11 +16,11 @@ from typing import Any, cast
 import pytest
 from batches import METADATA, counting
 from commands import BoundProcess, Run, multidrop, plant_file, running
-from examples import usually
 from lines import until
 from peers import require_module
 from recordings import recorded
 from simulated_pumps import simulated_test, write_test
+from tables import usually
 from toy import Toy
 
 from multidrop.bus import Bus

@@ -14,9 +14,9 @@ from typing import Any
 
 import pytest
 from commands import TOY, Run
-from examples import usually
 from lines import PATIENCE, patient, until
 from motors import ReceivedRequests
+from tables import usually
 from terminals import closing_terminal
 from toy import Status
 

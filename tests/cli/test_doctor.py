@@ -15,9 +15,8 @@ from typing import Any
 
 import pytest
 from commands import Run
-from examples import usually
 from ptys import SerialServer, pyserials_own, vanishing_pty
-from tables import table
+from tables import table, usually
 
 from multidrop.cli import doctor
 from multidrop.cli.doctor_findings import ROUNDS

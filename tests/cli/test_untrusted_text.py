@@ -15,11 +15,10 @@ from typing import Any
 import pytest
 from captures import write
 from commands import Run
-from examples import usually
 from frames import PRINTED
 from peers import require_module
 from recordings import record, row
-from tables import table
+from tables import table, usually
 from terminals import MULTIDROP
 
 import multidrop.cli

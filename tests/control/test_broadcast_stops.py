@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from examples import every_third
 from line_driver import MS, LineDriver
 from motors import MAKE, STARTS
 from simulated_bus import SimulatedBus, all_stopped, che_drives, is_write, one
-from tables import table
+from tables import every_third, table
 from toy import Status, Toy
 
 from multidrop.control.call import written_before

@@ -11,9 +11,8 @@ from typing import Any, cast
 
 import checksums
 import pytest
-from examples import usually
 from lines import PATIENCE, Faulty, patient, proof, until
-from tables import table
+from tables import table, usually
 from toy import Fault, Toy
 
 from multidrop.bus import Bus

@@ -13,9 +13,9 @@ from typing import Any
 
 import pytest
 from commands import BoundProcess
-from examples import usually
 from lines import PATIENCE, line, plant, polled, until
 from motors import ReceivedRequests
+from tables import usually
 
 from multidrop.bus import Bus
 from multidrop.control.exit_hook import CUT_SHORT, ExitHook, ExitTask

@@ -9,12 +9,11 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from examples import usually
 from motors import MAKE, STARTS
 from profile_families import MAKE as PROFILES
 from profile_families import STARTS as PROFILE_STARTS
 from simulated_bus import is_write, one
-from tables import table
+from tables import table, usually
 
 from multidrop.control import records
 from multidrop.control.outcome import Seen

@@ -18,8 +18,8 @@ from typing import Any
 
 import pytest
 from batches import new_completion
-from examples import usually
 from lines import PATIENCE, until
+from tables import usually
 from toy import Status, Toy
 
 from multidrop import NotMaster

@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from examples import usually
 from motors import MAKE
 from profile_families import MAKE as PROFILES
 from simulated_bus import Meanwhile, SimulatedBus, is_write, one, starts, writes
-from tables import table
+from tables import table, usually
 
 from multidrop import DelixiNative, InnovertIBD
 from multidrop.control import records

@@ -12,11 +12,11 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
-from examples import examples
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from motors import MAKE, STARTS
 from simulated_bus import SimulatedBus, is_write
+from tables import examples
 
 from multidrop.control.ramp import ramp, start_staggered
 from multidrop.core import Message

@@ -15,9 +15,8 @@ from typing import Any
 import checksums
 import pytest
 from commands import BoundProcess
-from examples import usually
 from simulated_bus import SimulatedBus, is_write, one
-from tables import table
+from tables import table, usually
 
 from multidrop.bus import Bus
 from multidrop.control.outcome import Effect

@@ -23,11 +23,11 @@ from typing import Any
 import checksums
 import pytest
 from checksums import rtu
-from examples import usually
 from lines import line, plant, polled, rows_of, until
 from motors import MAKE, REASONS, STARTS, ReceivedRequests, quick
 from responder import Responder, ResponderLine
 from responder_drives import KINDS, ResponderDrive
+from tables import usually
 
 from multidrop.bus import Bus
 from multidrop.core import Framing, Message, parse_request, set_settings

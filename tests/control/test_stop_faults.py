@@ -17,13 +17,12 @@ from types import FrameType, SimpleNamespace
 from typing import Any
 
 import pytest
-from examples import first_in_ci, in_turn, usually
 from interruptions import calling_at, failing_at, interrupted_at
 from motors import MAKE
 from own_drives import Fan
 from profile_families import ALL
 from simulated_bus import SimulatedBus, che_drives, is_write, one
-from tables import table
+from tables import first_in_ci, in_turn, table, usually
 
 import multidrop
 from multidrop.control import ramp, records, stops

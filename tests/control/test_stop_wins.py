@@ -20,7 +20,6 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
-from examples import usually
 from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import (
@@ -36,6 +35,7 @@ from lines import plant, polled
 from motors import quick
 from responder import Responder, ResponderLine
 from responder_drives import KINDS, ResponderDrive
+from tables import usually
 
 from multidrop.bus import Bus
 from multidrop.control.ramp import start_staggered

@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from examples import in_turn, usually
 from lines import PATIENCE, LateWire, plant, polled, until
 from lines import line as declared_line
 from motors import MAKE, ReceivedRequests, at_highest_rate
-from tables import table
+from tables import in_turn, table, usually
 
 from multidrop.bus import Bus
 from multidrop.control.records import read_audit

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from examples import usually
 from peers import ROOT, SANITIZERS, build_and_run
+from tables import usually
 
 pytestmark = pytest.mark.long
 WAITS_BY_EPOLL = pytest.mark.skipif(sys.platform != "linux", reason="others wait by poll")

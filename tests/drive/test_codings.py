@@ -12,11 +12,10 @@ from typing import Any
 
 import pytest
 from batches import UTC_0, add_rows, completion
-from examples import examples
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from simulated_bus import SimulatedBus
-from tables import table
+from tables import examples, table
 
 from multidrop.capture.decoding import RegisterLookup
 from multidrop.control.outcome import Effect

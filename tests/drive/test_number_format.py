@@ -8,11 +8,10 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from examples import examples
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from simulated_bus import SimulatedBus, real_clock
-from tables import table
+from tables import examples, table
 
 from multidrop.cli.support.values import as_json, nearest_value, value_text
 from multidrop.core import Message, NumberFormat

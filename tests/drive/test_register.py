@@ -10,12 +10,11 @@ from typing import Any
 
 import pytest
 from commands import Run as RunCommand
-from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from lines import ANY_PORT
 from simulated_bus import SimulatedBus
-from tables import table
+from tables import examples, table
 
 from multidrop import Condition
 from multidrop.core import Message, NumberFormat

@@ -13,11 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scripts import Wire
-from tables import table
+from tables import examples, table
 
 import multidrop.drive
 import multidrop.families

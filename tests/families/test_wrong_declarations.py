@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from examples import usually
 from profile_families import COMMANDED, READ_ONLY, shipped
 from simulated_bus import SimulatedBus, is_write
-from tables import table
+from tables import table, usually
 
 from multidrop.core import Framing, Message, build_reply
 from multidrop.drive import ANOTHER_FAMILY, Drive

@@ -17,12 +17,11 @@ from typing import Any
 
 import pytest
 from commands import MULTIDROP, BoundProcess, Run
-from examples import usually
 from fleets import plant_text
 from free_ports import free_ports
 from lines import PATIENCE, until
 from nats_clusters import Cluster, cluster, old_server_program
-from tables import table
+from tables import table, usually
 from terminals import on_terminal
 
 from multidrop.cli.fleet import demo

@@ -16,10 +16,10 @@ from typing import Any
 
 import pytest
 from commands import BoundProcess
-from examples import first_in_ci
 from gateways import simulated_plant
 from interruptions import every, interrupted_before
 from lines import PATIENCE, until
+from tables import first_in_ci
 
 from multidrop import Bus, InvtCHE, Plant
 from multidrop.gateway.gateway import Gateway

@@ -12,10 +12,10 @@ from typing import Any
 
 import pytest
 from brokers import end_paho_soon
-from examples import usually
 from gateways import Served, running, served, simulated_plant
 from lines import PATIENCE, until
 from peers import require_module
+from tables import usually
 
 import multidrop.gateway
 from multidrop import Plant, Poller

@@ -15,8 +15,8 @@ from typing import Any
 
 import pytest
 from commands import BoundProcess
-from examples import usually
 from histories import DAY, METADATA, NOON, SECOND, check_buckets, random_rows, record, rows_in
+from tables import usually
 
 from multidrop import open_recording, whole_file
 from multidrop.history import compact as compact_module

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from examples import examples, usually
 from histories import DAY, METADATA, NOON, SECOND, check_buckets, random_rows, record, rows_in
 from recordings import record_as_before
+from tables import examples, usually
 
 from multidrop import History
 from multidrop.history import growing

@@ -23,11 +23,11 @@ from typing import Any
 import histories
 import pytest
 from commands import BoundProcess
-from examples import first_in_ci
 from gateways import serving, simulated_plant
 from histories import DAY, METADATA, NOON, RUN, SECOND, STEP, batch, random_rows, record, rows_in
 from interruptions import full_at, read_only_directory
 from lines import PATIENCE, until
+from tables import first_in_ci
 
 from multidrop import History, Plant, Poller
 from multidrop.control import Seen

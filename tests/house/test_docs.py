@@ -23,8 +23,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
-from examples import usually
-from tables import table
+from tables import table, usually
 
 from multidrop import Plant, core
 from multidrop.cli import COMMANDS, main

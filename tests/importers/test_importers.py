@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 from commands import Run
-from examples import usually
 from imported import (
     ESPHOME,
     HOME,
@@ -26,7 +25,7 @@ from imported import (
     only,
 )
 from simulated_bus import SimulatedBus
-from tables import table
+from tables import table, usually
 
 from multidrop import NoValue, load_family
 from multidrop.drive.register import Access, Register

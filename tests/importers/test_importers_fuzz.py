@@ -12,11 +12,11 @@ from time import process_time
 from typing import Any
 
 import pytest
-from examples import examples, usually
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from imported import FILES
 from readers import read
+from tables import examples, usually
 
 ALL = [f"{suffix}\n{text}".encode() for suffix, texts in FILES.items() for text in texts]
 TOKENS = re.compile(rb"[A-Za-z_]+|[0-9.]+|\s+|.", re.DOTALL)

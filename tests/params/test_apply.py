@@ -16,12 +16,11 @@ from typing import Any
 
 import pytest
 from commands import BoundProcess
-from examples import first_in_ci, usually
 from interruptions import full_at
 from killable_client import DRIVE
 from simulated_bus import SimulatedBus
 from simulated_pumps import factory_reset, obey_the_line, raw_of, set_at_random, with_parameters, writable
-from tables import table
+from tables import first_in_ci, table, usually
 
 from multidrop import (
     YD1000,

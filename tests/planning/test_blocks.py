@@ -8,11 +8,10 @@ from itertools import permutations
 from typing import Any
 
 import pytest
-from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from own_drives import ADDRESSES, Meter, StatedMeter
-from tables import table
+from tables import examples, table
 
 from multidrop.core import Framing, Message, NumberFormat, build_request, reply_length
 from multidrop.drive import HOLDING_MULTIPLE, Drive

@@ -8,11 +8,11 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from line_driver import LineDriver
 from own_drives import ADDRESSES, Meter, StatedMeter
+from tables import examples
 
 from multidrop.cli import main
 from multidrop.core import Peer, build_reply

@@ -7,10 +7,10 @@ from collections import Counter
 from itertools import pairwise
 
 import pytest
-from examples import examples, usually
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+from tables import examples, usually
 
 from multidrop.planning.schedule import FIRST_PAUSE_NS, LONGEST_PAUSE_NS, TURN_SHARE, Job, Schedule
 

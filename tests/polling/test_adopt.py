@@ -12,9 +12,8 @@ from types import FrameType
 
 import pytest
 from clocked_lines import ClockedLines, ClockedWire, S
-from examples import usually
 from lines import line, plant, polled, rows_of
-from tables import table
+from tables import table, usually
 from toy import Toy
 
 from multidrop.core import Echo

@@ -14,9 +14,9 @@ from typing import Any
 
 import pytest
 from commands import descriptors, threads
-from examples import examples
 from lines import PATIENCE, line, plant, polled, until
 from serial.urlhandler import protocol_socket
+from tables import examples
 from toy import QuickToy, Toy
 
 from multidrop.bus import Bus

@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 import serial
-from examples import usually
 from lines import PATIENCE, line, patient, plant, polled, rows_of, until
+from tables import usually
 from toy import Toy
 
 from multidrop import PollingFailed

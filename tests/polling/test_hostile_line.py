@@ -20,7 +20,6 @@ from typing import Any
 import pytest
 from clocked_lines import ClockedLines, ClockedWire
 from commands import descriptors, threads
-from examples import usually
 from lines import LateWire, line, plant, polled, proofs, rows_of, served
 from motors import (
     LATEST,
@@ -33,7 +32,7 @@ from motors import (
     real_wires,
 )
 from stories import HEALTHY, Story
-from tables import table
+from tables import table, usually
 from toy import Toy
 
 from multidrop.drive import Drive

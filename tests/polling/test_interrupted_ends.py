@@ -20,10 +20,10 @@ from time import sleep
 from typing import Any
 
 import pytest
-from examples import usually
 from interruptions import Interruption, every, interrupted, interrupted_before
 from lines import ANY_PORT, PATIENCE, line, patient, plant, polled, until
 from motors import ReceivedRequests
+from tables import usually
 from toy import Toy
 
 from multidrop import Bus, InvtCHE, Poller

@@ -16,10 +16,9 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from examples import usually
 from lines import HOST_LATE, PATIENCE, line, plant, polled, rows_of, until
 from serial.urlhandler import protocol_socket
-from tables import table
+from tables import table, usually
 from toy import QuickToy, Toy
 
 from multidrop import Bus, NotMaster

@@ -10,12 +10,11 @@ from typing import Any
 
 import pytest
 from clocked_lines import ClockedLines, ClockedWire
-from examples import examples, usually
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from lines import line, patient, plant, polled, rows_of, until
 from profile_families import shipped
-from tables import table
+from tables import examples, table, usually
 from toy import Picky, Toy, expected_values, family
 
 from multidrop.core import Message, NumberFormat

@@ -12,9 +12,8 @@ from pathlib import Path
 
 import pytest
 from clocked_lines import ClockedLines, ClockedWire
-from examples import usually
 from lines import PATIENCE, line, plant, polled, rows_of, until
-from tables import table
+from tables import table, usually
 from toy import Status, Toy
 
 from multidrop import poller as poller_module

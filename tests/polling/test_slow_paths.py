@@ -11,7 +11,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import ClassVar
 
 import pytest
-from examples import every_fourth, usually
 from lines import proof
 from motors import LINES, MAKE, ReceivedRequests, of_all_variants, of_one_variant
 from stories import (
@@ -28,7 +27,7 @@ from stories import (
     read_truly,
     stalling,
 )
-from tables import table
+from tables import every_fourth, table, usually
 
 from multidrop.bus import Bus
 from multidrop.control.outcome import Effect

@@ -17,11 +17,10 @@ import pyarrow as pa
 import pyarrow.parquet
 import pytest
 from batches import EXAMPLE, METADATA, add_miss, add_rows, block, completion, counting, example
-from examples import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from recordings import FILE_SCHEMA, SCHEMA, is_kept, record_as_before, rows_of
-from tables import table
+from tables import examples, table
 
 from multidrop.core import Columns, Names, Status
 from multidrop.plant.model import Plant

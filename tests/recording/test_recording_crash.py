@@ -19,10 +19,9 @@ import pyarrow.parquet
 import pytest
 from batches import DRIVES, METADATA, REGISTERS, SECOND, UTC_0, add_rows, block, completion, counting, example
 from commands import BoundProcess
-from examples import examples, usually
 from interruptions import full_at, read_only_directory
 from recordings import recorded, rows_of
-from tables import table
+from tables import examples, table, usually
 from toy import Toy
 
 from multidrop.core import Columns, Names

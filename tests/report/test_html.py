@@ -12,9 +12,9 @@ from typing import Any
 
 import pytest
 from batches import METADATA, SECOND, UTC_0, example
-from examples import usually
 from peers import require_installed
 from recordings import ABOUT, record, row
+from tables import usually
 
 from multidrop.polling.batch import Row
 from multidrop.recording import open_recording, open_writer

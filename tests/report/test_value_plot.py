@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 from batches import SECOND, UTC_0
 from commands import Run
-from examples import usually
 from peers import require_installed
 from recordings import record, row
+from tables import usually
 
 from multidrop.polling.batch import Row
 

@@ -18,11 +18,10 @@ from typing import Any, ClassVar
 
 import pytest
 from commands import MULTIDROP, BoundProcess
-from examples import first_in_ci
 from lines import patient, until
 from simulated_bus import is_write
 from simulated_pumps import CHE, STEPS, far_ends, simulated_test, turning, write_test
-from tables import table
+from tables import first_in_ci, table
 
 from multidrop.bus import Bus
 from multidrop.control import read_audit

@@ -18,10 +18,10 @@ from typing import Any
 import pytest
 import spooled
 from commands import BoundProcess
-from examples import first_in_ci
 from interruptions import full_at, read_only_directory
 from lines import until
 from spooled import exchanges_in, numbered, rows_in, rows_of
+from tables import first_in_ci
 
 from multidrop.samples import spool as spool_module
 from multidrop.samples.message import Packed, RowBuffer, unpack

@@ -14,12 +14,11 @@ from typing import Any
 
 import pytest
 import seeds
-from examples import examples, usually
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from profile_families import METER, METER_CSV, Meter, write_meter
 from readers import read
-from tables import table
+from tables import examples, table, usually
 
 from multidrop import Drive, load_family
 from multidrop.core import NumberFormat

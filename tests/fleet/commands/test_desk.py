@@ -18,10 +18,9 @@ from unittest.mock import patch
 
 import pytest
 from commands import BoundProcess
-from examples import every_third
 from fleets import LINE, PATIENCE_S, Desks, desks
 from lines import PATIENCE, patient
-from tables import table
+from tables import every_third, table
 
 from multidrop import InvtCHE, Stopped
 from multidrop.control import CommandOutcome, Seen, read_audit, records

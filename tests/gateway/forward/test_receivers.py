@@ -24,13 +24,13 @@ import forwarded
 import pytest
 from brokers import Listener, mosquitto
 from commands import BoundProcess
-from examples import first_in_ci
 from forwarded import DRAIN, Key, forwarding, keys_in, rows_at_noon, store, web_server
 from free_ports import free_ports
 from lines import until
 from peers import require_module, require_program
 from postgres_clusters import postgres
 from spooled import NOON, STEP, rows_of
+from tables import first_in_ci
 
 from multidrop.gateway.forward.influx import line_protocol
 from multidrop.gateway.sending import post

@@ -19,10 +19,10 @@ from typing import Any
 
 import pytest
 from controlled_loop import Clock
-from examples import usually
 from gateways import Served, certificate, get, served, serving, simulated_plant
 from lines import PATIENCE, until
 from starlette.requests import Request
+from tables import usually
 
 from multidrop.control import CommandResult
 from multidrop.control.commands import MOST_STOPS

@@ -17,10 +17,10 @@ from tempfile import mkdtemp
 from typing import Any
 
 import pytest
-from examples import usually
 from gateways import gateway_of
 from lines import until
 from modbus_tools import Libmodbus, Mbpoll, Pymodbus, PyModbusTcp
+from tables import usually
 
 from multidrop import Plant
 from multidrop.cli import main

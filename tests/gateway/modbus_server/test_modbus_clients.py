@@ -13,8 +13,8 @@ from typing import cast
 import pytest
 from controlled_loop import ControlledLoop
 from controlled_loop import run_controlled as run_test
-from examples import usually
 from modbus_gateway import DONE, PATIENCE, FakeLine, Gateway, RawClient, RawReply, plant_of, request, serving
+from tables import usually
 
 from multidrop import Drive, reading
 from multidrop.control import CommandResult

@@ -11,12 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from examples import usually
 from gateways import Served, gateway_of, served
 from lines import until
 from modbus_gateway import RawClient, RawReply, plant_of, request
 from modbus_tools import Libmodbus, Mbpoll, Minimalmodbus, Pymodbus
-from tables import table
+from tables import table, usually
 
 from multidrop import Drive, InvtCHE, Plant, PlantError, load_family, reading, setting, text
 from multidrop.control import read_audit

@@ -9,10 +9,9 @@ from typing import Any, NamedTuple
 
 import pytest
 from batches import UTC_0, add_rows, completion
-from examples import PART
 from hypothesis import example, given
 from hypothesis import strategies as st
-from tables import table
+from tables import PART, table
 
 from multidrop.core import Columns, Names, NumberFormat, RowLayout
 from multidrop.drive import Drive

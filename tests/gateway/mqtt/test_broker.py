@@ -20,11 +20,11 @@ import pytest
 from brokers import PLAIN_FAN, ROOT, Host, Listener, Running, command, has, mosquitto, nats, publish
 from brokers import Broker as BrokerProcess
 from brokers import Broker as RunningBroker
-from examples import usually
 from gateways import Served, plant_text, running, tokens
 from lines import HOST_LATE, until
 from nats_clusters import old_server_program, server_program
 from peers import require_module
+from tables import usually
 
 from multidrop import Batch, InvtCHE, Plant
 from multidrop.control import CommandOutcome, CommandResult

@@ -17,12 +17,11 @@ from typing import Any
 
 import pytest
 from brokers import FAN, Broker, Listener, Published, Running, has, inside, publish, without_fan
-from examples import in_turn
 from free_ports import free_port
 from gateways import certificate, served
 from lines import until
 from peers import require_module
-from tables import table
+from tables import in_turn, table
 
 from multidrop import Drive, InvtCHE, PolledDrive
 from multidrop.control import CommandOutcome, CommandResult
