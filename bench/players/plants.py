@@ -38,7 +38,7 @@ MOTOR = "fan"
 EVERY = 2.0  # s, period of each drive's first register; the other registers have no rate
 PATIENCE = 30.0  # longest wait for the simulator's start, in s
 BEAT = 5e-3  # time between two measurements of the simulator's delays, in s
-LONG = 30e-3  # s; after a longer delay of the simulator, a reply may miss its time-out
+LONG = 30e-3  # s; after a longer delay of the simulator, a reply may come after its time-out
 
 
 def write_plant(directory: Path, lines: int) -> Path:
@@ -95,7 +95,7 @@ class RunningPlant:
         return late
 
     def was_held_up(self, since: float) -> bool:
-        """Return True if a delay after the time `since` may have made replies miss their time-out."""
+        """Return True if, after the time `since`, a delay may have made replies later than their time-out."""
         return max(self._late[1:]) >= since
 
 

@@ -806,7 +806,7 @@ def test_closing_a_port_wakes_the_threads_that_wait_for_it(drive: Drive) -> None
 
 
 def test_is_asking_is_true_for_peers_of_queued_repeated_and_urgent_exchanges() -> None:
-    """`is_asking` is true while the peer's exchanges wait or are in flight, but not for another peer."""
+    """`is_asking` is true while a drive's exchanges wait or are in flight, but not for another drive."""
     with opened(room=4) as (port, far):
         queued, repeated, other = (read(1, timeout=0.02) for _ in range(3))
         assert not port.is_asking(queued.peer)

@@ -52,7 +52,7 @@ STATUSES = ("ok", "no reply")
 
 
 def exchanges(lines: int, dice: random.Random) -> Iterator[tuple[int, int, int, list[float] | None]]:
-    """Yield each exchange: its time and uncertainty, the drive's number, and the values (None: a miss)."""
+    """Yield each exchange: its time and uncertainty, the drive's number, and the values (None: missing)."""
     due = [(dice.randrange(12_000_000), line) for line in range(lines)]
     heapq.heapify(due)
     turn = [0] * lines

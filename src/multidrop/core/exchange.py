@@ -335,7 +335,7 @@ class Completion:
     sent_ns = number_at("c.sent_ns")  # when the request was sent; 0: never
     first_ns = number_at("c.first_ns")  # when the first byte after the request arrived; 0: none came
     last_ns = number_at("c.last_ns")  # when the last byte arrived; 0: none came
-    # copy of the peer's `late_until_ns` from the time when the exchange was requested
+    # copy of the drive's `late_until_ns` from the time when the exchange was requested
     late_until_ns = number_at("c.late_until_ns")
     stale = number_at("c.stale")  # number of bytes discarded before the request was sent
     skipped = number_at("c.skipped")  # number of bytes after the request that are not part of the reply
@@ -393,7 +393,7 @@ class Peer:
                 "history": self._history,
             },
         )
-        self.number = next(_NUMBERS)  # identifies this peer within the process
+        self.number = next(_NUMBERS)  # identifies this record within the process
         self.proofs: tuple[Exchange, ...] = ()
         self.unasked: Counter[Status] = Counter()  # number of due values that were not requested, by status
 
@@ -419,7 +419,7 @@ class Peer:
     ready_ns = number_at("c.ready_ns")  # ns; earliest time of the next request
 
     def inherit(self, before: Peer) -> None:
-        """Take over the outstanding requests of `before`, the earlier peer at this peer's address."""
+        """Also expect late replies to requests of `before`, the earlier drive at this drive's address."""
         lib.md_late_inherit(self.c, before.c)
 
     def prove_by(self, proofs: Sequence[Exchange]) -> None:

@@ -475,7 +475,7 @@ class Port:
             raise OSError(-failure, "the transceiver cannot be switched")
 
     def is_asking(self, peer: Peer) -> bool:
-        """Return True while an exchange with this peer is queued, repeated, urgent or in flight."""
+        """Return True while an exchange with this drive is queued, repeated, urgent or in flight."""
         return bool(lib.md_port_is_asking(self.c, peer.c))
 
     def counted_ns(self) -> int:
@@ -483,7 +483,7 @@ class Port:
         return int(lib.md_port_counted_ns(self.c))
 
     def inherit(self, peer: Peer, before: Peer) -> None:
-        """Let `peer` take over the outstanding requests of `before`, the peer that it replaces."""
+        """Let `peer` also expect late replies to requests of `before`, the earlier drive at its address."""
         self._memory.lasting.update((peer, before))
         lib.md_port_inherit(self.c, peer.c, before.c)
 
@@ -524,7 +524,7 @@ class Port:
         """Queue exchanges, each with its earliest start in ns; return how many fitted into the queue."""
         todo = ffi.new("struct md_exchange *[]", [exchange.c for exchange in exchanges])
         times = ffi.new("int64_t[]", not_before_ns)
-        # keep the peers: late replies from them may still come
+        # keep the drives' records: late replies may still come
         self._memory.lasting.update(exchange.peer for exchange in exchanges)
         free = exchanges[: self.room - self.pending]
         for at, exchange in enumerate(free, int(self._progress.submitted)):
@@ -554,7 +554,7 @@ class Port:
         Reuse the completion `into` if it has room for the values. The request is not sent after
         `expires_ns` (CLOCK_BOOTTIME; 0: no limit), nor after a stop has revoked the exchange's permit.
         """
-        self._memory.lasting.add(exchange.peer)  # keep the peer: a late reply may still come
+        self._memory.lasting.add(exchange.peer)  # keep the drive's record: a late reply may still come
         found = into if into is not None and into.room == exchange.room else Completion(room=exchange.room)
         found.count = lib.md_port_carry_out(
             self.c, exchange.c, not_before_ns, expires_ns, found.c, found.values

@@ -178,7 +178,7 @@ class Peers:
             self._asked.pop(asking, None)
 
     def is_asking(self, peer: Peer) -> bool:
-        """Return True while an exchange with this peer is about to start, queued or in flight."""
+        """Return True while an exchange with this drive is about to start, queued or in flight."""
         return self._is_asked(peer) or self._line.is_asking(peer)
 
     def _is_asked(self, peer: Peer) -> bool:

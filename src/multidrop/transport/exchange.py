@@ -280,7 +280,7 @@ class Exchanges:
         return self._ask(drive, read, attempts).data
 
     def _prepare(self, drive: Drive) -> PreparedReads:
-        """Return the drive's cached reads, or new ones if the port, the settings or the peer has changed."""
+        """Return the drive's cached reads, or new ones if the port, the settings or the drive has changed."""
         peer = self.peers.present.get(drive) or self.peers.of(drive)
         asked_as = (drive.address, drive.framing, drive.settings, drive.agreed_silence, drive.response_delay)
         made_for = (peer, self.line.queue, *asked_as)

@@ -352,7 +352,7 @@ class Line:
         return self._opened.settings if self._opened.bridge else None
 
     def inherit(self, peer: Peer, before: Peer) -> None:
-        """Let `peer` also expect late replies to requests of `before`, the earlier peer at its address."""
+        """Let `peer` also expect late replies to requests of `before`, the earlier drive at its address."""
         with self._lock:
             if self.queue:
                 self.queue.inherit(peer, before)
@@ -405,7 +405,7 @@ class Line:
                 self._let_go()
 
     def is_asking(self, peer: Peer) -> bool:
-        """Return True while an exchange with this peer is queued or in flight on the port."""
+        """Return True while an exchange with this drive is queued or in flight on the port."""
         with self._lock:
             return self.queue is not None and self.queue.is_asking(peer)
 
