@@ -219,7 +219,7 @@ class Line:
         with self._lock:
             if self._is_over:  # an interrupted earlier call of `open` has closed the line
                 raise self._closed()
-            self._reopen()
+            self.reopen()
 
     def _open(self) -> None:
         self._why_closed = "it is closed"
@@ -287,12 +287,8 @@ class Line:
         past_ns = clock.now_ns() - self.ended_ns if self.ended_ns else 0
         return max(0.0, CLOSING_S - past_ns / 1e9)
 
-    @undisturbed
     def reopen(self) -> None:
         """Close the port and open it again. Raises LineError if the port is absent."""
-        self._reopen()
-
-    def _reopen(self) -> None:
         with self._lock:
             self._let_go()
             self._open()
@@ -325,7 +321,7 @@ class Line:
             if not self.is_lost:
                 return
             try:
-                self._reopen()
+                self.reopen()
             except Exception as failure:  # pyserial and its backends may raise any exception
                 reason = failure.reason if isinstance(failure, LineError) else words_of(failure)
                 self._why_closed = self._why_lost = reason
