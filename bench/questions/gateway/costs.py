@@ -121,7 +121,7 @@ class Worker:
         """Make a frame of live values, and encode its changes for viewers that have the previous frame."""
         frames = self.gateway.frames
         frames._build()
-        frames._since(frames._remembered[-2]["n"] if len(frames._remembered) > 1 else WHOLE)
+        frames._since(frames._kept[-2]["n"] if len(frames._kept) > 1 else WHOLE)
 
     def next_viewer(self) -> Callable[[], Any]:
         """Return a function that sends a frame's changes to a second viewer, after the first one got them."""
@@ -129,7 +129,7 @@ class Worker:
         for _ in range(2):
             self.take_rows()
             frames._build()
-        return partial(frames._since, frames._remembered[0]["n"])
+        return partial(frames._since, frames._kept[0]["n"])
 
     def whole_frame(self) -> None:
         self.gateway.frames._build()

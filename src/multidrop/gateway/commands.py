@@ -375,7 +375,7 @@ async def stop_meant(
     sent: dict[str, Drive | None] = {}
     begun: list[asyncio.Task[dict[str, CommandResult]]] = []
     while True:
-        is_settled, plant = lines.plant_coming is None, lines.plant_now
+        is_reloading, plant = lines.plant_coming is not None, lines.plant_now
         there = drives_of(plant)
         wanted = there if drives is None else dict.fromkeys(meant.values())
         left = [one for one in wanted if one not in sent or there.get(one, sent[one]) is not sent[one]]
@@ -385,10 +385,10 @@ async def stop_meant(
             begun.append(supervisor().start("stop", stop(plant, left)))
         elif pending:
             await asyncio.wait(pending, timeout=LOOK_S, return_when=asyncio.FIRST_COMPLETED)
-        elif is_settled:
-            break
-        else:
+        elif is_reloading:
             await asyncio.sleep(LOOK_S)
+        else:
+            break
     results = {name: end for stopping in begun for name, end in stopping.result().items()}
     failed = [name for name, end in results.items() if not end.ok]
     if failed and plant.lines != before:

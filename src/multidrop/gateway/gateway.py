@@ -38,7 +38,7 @@ from multidrop.gateway.settings import AUDIT_S, ServeSettings, check_writable
 from multidrop.supervisor import Hung, in_time, supervisor
 
 TAKE_S = 0.1  # interval, in s, of taking polled values from the poller: half of LOOK_S
-LOOK_S = 0.2  # interval of checks for alarms; after each check, the pages get a frame of values
+LOOK_S = 0.2  # interval, in s, of checks for alarms; after each check, the pages get a message
 TICK_S = 1.0  # interval, in s, of reading the poller's statistics
 LOG_S = 60.0  # shortest time, in s, between two log lines about failures of the same part
 RESTORE_S = 2.0  # how long to wait, in s, until the alarms of earlier runs are read from the disk
@@ -75,7 +75,7 @@ class Gateway:
         self._logged: dict[str, float] = {}
         self.begun = self.clock()
         self._looked = 0.0
-        self._has_news = False  # True: something has changed since the newest frame
+        self._has_news = False  # True: something has changed since the newest message to the page
         self.ledger = ledger or Ledger()
         self.poller: Poller | None = None  # None before polling starts
         self._made: Poller | None = None  # the poller, also while it is still starting
@@ -349,7 +349,7 @@ class Gateway:
             self.guarded("minute", self.hub.note_minute)
             self.guarded("connections", self.connections.sweep)
             supervisor().look()
-            # make a frame even without new values: its time shows viewers that the gateway is alive
+            # send a message even without new values: its time shows viewers that the gateway is alive
             self._has_news = True
             if notifier.watchdog_s:
                 notifier.send("WATCHDOG=1")

@@ -1,4 +1,4 @@
-"""Page frames (the values that viewers get): shared by all viewers, at most five a second, never queued."""
+"""Messages to the page: shared by all viewers, at most five a second, never queued."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.http.routes import FrameRoute
 from multidrop.gateway.live import frames as module
-from multidrop.gateway.live.frames import REMEMBERED, WHOLE, Encoded, Frames, changes
+from multidrop.gateway.live.frames import KEPT, WHOLE, Encoded, Frames, changes
 from multidrop.gateway.settings import ServeSettings
 
 
@@ -189,7 +189,7 @@ async def view(pictures: list[tuple[dict[str, Any], int]], begin: int) -> None:
                 has[every] = news
             else:
                 assert mine is not None
-                assert since == mine["n"] > news["n"] - REMEMBERED
+                assert since == mine["n"] > news["n"] - KEPT
                 has[every] = merged(mine, news)
             assert has[every] == whole[max(whole)]
 

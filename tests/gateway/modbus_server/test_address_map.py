@@ -124,7 +124,7 @@ class Client:
 
         def read() -> bool:
             found.append(self.of(row).read(row["unit_id"], function, address, count))
-            return found[-1] not in (6, 11)  # 6: line time used up, 11: reply lost on a busy machine
+            return found[-1] not in (6, 11)  # 6: bus time used up, 11: reply lost on a busy machine
 
         until(read)
         return found[-1]

@@ -437,7 +437,7 @@ def pipeline(client: RawClient, unit: int, requests: int) -> int:
             start, count = asked.pop(reply.transaction)
             assert reply.unit == unit
             if start >= POLLED and reply.code == 6:
-                continue  # the share of line time that clients may use is used up
+                continue  # the share of bus time that clients may use is used up
             assert (reply.function, reply.words) == (3, expected(unit, start, count))
             passed += start >= POLLED
         assert asked == {}
@@ -569,7 +569,7 @@ async def test_a_ninth_request_that_waits_for_the_line_is_refused_immediately() 
         share.ask("one", line.ask)
     results = await asyncio.gather(*asked, return_exceptions=True)
     assert results[0] == [1]
-    # the share of line time that clients may use is used up
+    # the share of bus time that clients may use is used up
     assert all(isinstance(result, PassingBusy) for result in results[1:])
 
 

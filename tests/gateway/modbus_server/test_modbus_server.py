@@ -86,10 +86,10 @@ def test_a_polled_value_is_answered_without_a_request_on_the_line(gateway: Gatew
     assert gateway.line.asked == []
 
 
-@pytest.mark.parametrize("why", ["a miss", "old", "never asked", "from before the machine slept"])
+@pytest.mark.parametrize("why", ["a failed read", "old", "never asked", "from before the machine slept"])
 def test_a_stale_value_is_read_again_from_the_drive(gateway: Gateway, why: str) -> None:
     key = "mill", "output_voltage"
-    if why == "a miss":
+    if why == "a failed read":
         gateway.hub.values[key] = None
     elif why == "old":
         gateway.hub.ages[key] = 60.0
@@ -235,13 +235,13 @@ def test_a_failed_read_has_its_exception_code(gateway: Gateway, failure: Excepti
 @pytest.mark.slow
 def test_reads_beyond_the_clients_share_of_line_time_are_answered_busy(gateway: Gateway) -> None:
     gateway.hub.values.clear()
-    gateway.line.seconds = 0.6  # three times BURST_S, the line time that clients may use at once
+    gateway.line.seconds = 0.6  # three times BURST_S, the bus time that clients may use at once
     with gateway.client() as client:
         client.send(b"".join(request(number, 1, 3, CHE_OUTPUT_VOLTAGE, 1) for number in range(12)))
         replies = [client.receive() for _ in range(12)]
     codes = {reply.transaction: reply.code for reply in replies if reply is not None}
     assert codes == {0: None, **dict.fromkeys(range(1, 12), 6)}
-    assert len(gateway.line.asked) == 1  # No line time is left for 2 s, so the other reads expire.
+    assert len(gateway.line.asked) == 1  # No bus time is left for 2 s, so the other reads expire.
 
 
 def test_a_write_is_carried_out_by_the_gateways_commands_and_echoed(gateway: Gateway) -> None:

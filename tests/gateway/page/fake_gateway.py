@@ -25,7 +25,7 @@ HEADERS = {
     "Cross-Origin-Resource-Policy": "same-origin",
 }
 FRAMES_A_SECOND = 5  # limit of messages to the page per second, as in the real gateway
-REMEMBERED = 5  # number of messages to the page that are kept
+KEPT = 5  # number of messages to the page that are kept
 HOLD_S = 20  # seconds until a request that waits for a new message is answered with 304
 
 
@@ -97,7 +97,7 @@ class FakeGateway:
                     told["drives"][self.clocked]["values"]["output_frequency"][0] = time.time() % 1000
                 for name, drive in told["drives"].items():
                     drive |= {"stops": self.stops.get(name, 0), **self.drive_changes.get(name, {})}
-                newest = [*self._made.items()][-REMEMBERED:]
+                newest = [*self._made.items()][-KEPT:]
                 told |= self.changes
                 told["alarms"] = [*map(as_answer, told["alarms"])]
                 self._made = dict([*newest, (number, told)])

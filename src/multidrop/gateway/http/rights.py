@@ -22,7 +22,7 @@ ANYONE = "anyone"
 
 # limit of wrong tokens from one address, and for how many seconds each wrong token counts
 MOST_WRONG, WINDOW_S = 5, 60.0
-MOST_ADDRESSES = 10_000  # limit of addresses whose wrong tokens are remembered
+MOST_ADDRESSES = 10_000  # limit of stored addresses of clients with wrong tokens
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,63}")
 SCHEMES = ("http", "https")
 COMMAND_ID = re.compile(r"[!-~]{1,64}")
@@ -156,7 +156,7 @@ class Tokens:
     def note_wrong(self, address: str, secret: str, now: float) -> bool:
         """Count a wrong token; return False if this address has sent the same token recently, else True.
 
-        If MOST_ADDRESSES are remembered already, the oldest address is forgotten.
+        If MOST_ADDRESSES are stored already, the oldest address is deleted.
         """
         given = digest(secret)
         if address not in self._wrong and len(self._wrong) >= MOST_ADDRESSES:

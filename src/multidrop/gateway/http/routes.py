@@ -373,7 +373,7 @@ class Pages(PageFiles):
         return self._stops.begin(what, lambda: supervisor().start("stop", work()))
 
     def _admission(self, drive: str, command: object, body: Mapping[str, Any]) -> Admit:
-        """Return a function that admits a command only if its sender has seen a recent frame of values."""
+        """Return a function that admits a command only if its sender's page has recent values."""
         frames = self._gateway.seen_frames
         return lambda what: frames.admit(drive, what, (drive, command), frame_in(body))
 

@@ -1,8 +1,8 @@
-"""Frames: descriptions of the plant's state for all viewers, made at most five times a second.
+"""Frames: messages with the plant's state for all viewers, such as pages, at most five a second.
 
-A viewer, such as a page, requests a frame only after it has received the previous frame, so no queue builds
-up for a slow viewer. The request has the number of the viewer's newest frame, and the answer has the changes
-since that frame. If the gateway no longer remembers that frame, the answer is the whole newest frame.
+A viewer requests a message only after it has received the previous one, so no queue builds up for a slow
+viewer. The request has the number of the viewer's newest message, and the answer has the changes since that
+message. If the gateway has deleted that message, the answer is the whole newest message.
 """
 
 from __future__ import annotations
@@ -22,13 +22,12 @@ from multidrop.gateway.live.alarms import LOST, Alarms
 from multidrop.gateway.live.hub import Hub, KeptRow
 from multidrop.gateway.live.recent_statistics import RecentStatistics
 
-LEAST_S = 0.2  # shortest mean time, in s, between two frames
-EARLY_S = 0.02  # in s: after a late frame, the next one may be early by at most this time
-WAIT_S = 20.0  # longest wait, in s, of a request for a frame
+LEAST_S = 0.2  # shortest mean time, in s, between two messages to the page
+EARLY_S = 0.02  # in s: after a late message, the next one may be early by at most this time
+WAIT_S = 20.0  # longest wait, in s, of a request for a new message
 MOST_VIEWERS = 200  # limit of concurrently waiting viewers
-WHOLE = -1  # frame number in the request of a viewer that has no frame yet
-# number of newest frames that are kept, so that viewers up to a second behind still get changes only
-REMEMBERED = 6
+WHOLE = -1  # message number in the request of a viewer that has no message yet
+KEPT = 6  # number of newest messages that are kept, so that viewers up to a second behind get changes only
 
 Times = tuple[int, int]  # one moment in UTC and by CLOCK_MONOTONIC, both in ns
 MOST_AGE_NS = round(MOST_AGE_S * 1e9)
@@ -38,7 +37,7 @@ ANOTHER_PLANT = "the plant was read again"
 
 
 class Encoded(NamedTuple):
-    """A frame as it is sent to a viewer: the whole frame, or only the changes since an earlier frame."""
+    """A message as it is sent to a viewer: the whole message, or only the changes since an earlier one."""
 
     n: int
     plain: bytes
@@ -55,7 +54,7 @@ def frame_of(
     revision: int,
     time_ns: int,
 ) -> dict[str, Any]:
-    """Return the present frame. `stops` has the number of stops called so far, by drive."""
+    """Return a message about the plant's present state. `stops` is the number of stops so far, by drive."""
     return {
         "n": n,
         "revision": revision,
@@ -166,10 +165,10 @@ def changes(before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
 
 
 class Frames:
-    """The newest frames, and the viewers that wait for the next frame.
+    """The newest messages to the page, and the viewers that wait for the next one.
 
-    `clock` returns monotonic seconds. Frame numbers start at `begin`, which must be random, so that a frame
-    of an earlier process is never mistaken for one of this process.
+    `clock` returns monotonic seconds. Message numbers start at `begin`, which must be random, so that a
+    message of an earlier process is never mistaken for one of this process.
     """
 
     def __init__(
@@ -178,7 +177,7 @@ class Frames:
         self._make = make
         self._clock = clock
         self._begin = begin
-        self._remembered: deque[dict[str, Any]] = deque(maxlen=REMEMBERED)  # newest frames, the newest last
+        self._kept: deque[dict[str, Any]] = deque(maxlen=KEPT)  # newest messages, the newest last
         # the newest message to the page, encoded for viewers that have message N, by N; WHOLE: have none
         self._encoded: dict[int, Encoded] = {}
         self._due = 0.0
@@ -193,7 +192,7 @@ class Frames:
         return len(self._waiting)
 
     def note_news(self) -> None:
-        """Note that the plant's state has changed since the newest frame."""
+        """Note that the plant's state has changed since the newest message to the page."""
         self._has_news = True
         self._build_when_due()
 
@@ -211,10 +210,10 @@ class Frames:
         self._build_when_due()
 
     async def after(self, n: int) -> Encoded | None:
-        """Return the newest frame as soon as its number is not `n`; None if WAIT_S pass without a new frame.
+        """Return the newest message as soon as its number is not `n`; None if none is made within WAIT_S.
 
-        If frame `n` is still remembered, the result has only the changes since that frame. Raises
-        OverflowError if too many viewers wait.
+        If message `n` is still kept, return only the changes since then. Raises OverflowError if too many
+        viewers wait.
         """
         if self._has_news and self._clock() >= self._due:
             self._build()
@@ -237,20 +236,20 @@ class Frames:
         return self._since(n)
 
     def close(self) -> None:
-        """Answer all waiting viewers now, without a new frame."""
+        """Answer all waiting viewers now, without a new message."""
         self._is_closed = True
         self._wake()
 
     def _since(self, n: int) -> Encoded | None:
-        """Return the changes from frame `n` to the newest frame; None if frame `n` is the newest.
+        """Return the changes from message `n` to the newest message; None if message `n` is the newest.
 
-        If frame `n` is not remembered, or is from before a reload, return the whole newest frame.
+        If message `n` is deleted, or was made before a reload, return the whole newest message.
         """
-        if not self._remembered or self._remembered[-1]["n"] == n:
+        if not self._kept or self._kept[-1]["n"] == n:
             return None
-        newest = self._remembered[-1]
-        known = next((one for one in self._remembered if one["n"] == n), None)
-        # frames from before a reload may have other keys
+        newest = self._kept[-1]
+        known = next((one for one in self._kept if one["n"] == n), None)
+        # a message from before a reload may have other keys
         if known is None or known["revision"] != newest["revision"]:
             n, known = WHOLE, None
         if n not in self._encoded:
@@ -261,7 +260,7 @@ class Frames:
 
     def _build(self) -> None:
         self.made += 1
-        self._remembered.append(self._make(self._begin + self.made))
+        self._kept.append(self._make(self._begin + self.made))
         self._encoded.clear()
         self._due = max(self._due + LEAST_S, self._clock() + LEAST_S - EARLY_S)
         self._has_news = False
@@ -281,9 +280,9 @@ def _let_go(turn: asyncio.Future[None]) -> None:
 class SeenFrames:
     """Protects commands over HTTP from networks that delay or repeat them.
 
-    A write, or a verb that may start a motor, contains the number of the newest frame that its sender has
-    seen. The command is sent once, within MOST_AGE_S of that frame, and only if no stop of the drive and no
-    reload followed the frame. Clocks of other computers are not used.
+    A write, or a verb that may start a motor, contains the number of the newest message to its sender's page.
+    The command is sent once, within MOST_AGE_S of that message, and only if neither a stop of the drive nor a
+    reload followed the message. Clocks of other computers are not used.
 
     `clock` returns a time in ns that goes on while the computer sleeps.
     """
@@ -291,12 +290,12 @@ class SeenFrames:
     def __init__(self, clock: Callable[[], int], commands: Commands) -> None:
         self.clock = clock
         self._commands = commands
-        self._made: dict[int, int] = {}  # by frame number: when the frame was made (ns)
+        self._made: dict[int, int] = {}  # by message number: when the message was made (ns)
         # by number of a message to the page: commands that were admitted from senders with this message
         self._came: dict[int, set[object]] = {}
 
     def note(self, n: int) -> None:
-        """Record that frame `n` is made now."""
+        """Record that message `n` to the page is made now."""
         now_ns = self.clock()
         self._made[n] = now_ns
         for old in [one for one, made_ns in self._made.items() if now_ns - made_ns > MOST_AGE_NS]:

@@ -132,7 +132,7 @@ class RecentStatistics:
 
 
 def misses_of(statistics: Statistics) -> dict[str, int]:
-    """Return the number of missed values by the reason of the miss; reasons without a miss are left out."""
+    """Return the number of missing values by reason. Reasons without a missing value are left out."""
     return {why: n for why, n in statistics.misses.items() if n > 0}
 
 

@@ -33,11 +33,11 @@ from multidrop.gateway.modbus_server.words import STOP
 from multidrop.supervisor import supervisor
 
 SHARE = 0.2  # default share of a line's time that is used for requests of clients
-BURST_S = 0.2  # limit, in s, of unused line time that is saved for later requests
+BURST_S = 0.2  # limit, in s, of unused bus time that is saved for later requests
 MOST_WAITING = 8  # limit of the requests that wait for one line
 EXPIRY_S = 1.0  # in s: a request that has waited for this long is dropped
 CLOSED = "the gateway is shutting down, or has read its plant file again"
-# in s: after a standstill of the gateway, writes are refused for this long, because they may be old
+# in s: if the gateway did not run, it then refuses writes for this long, because they may be old
 SETTLE_S = 1.0
 # in s: how long the answer to a stop waits for the motor; less than the usual timeout of clients
 STOP_WAIT_S = 0.4
@@ -62,7 +62,7 @@ class LineShare:
         self.share = share
         self._waiting: list[_WaitingRead] = []
         self._running: asyncio.Task[None] | None = None
-        self._left_s = BURST_S  # line time, in s, that requests may use now; negative after a long request
+        self._left_s = BURST_S  # bus time, in s, that requests may use now; negative after a long request
         self._filled = self._loop.time()
         self._timer: asyncio.TimerHandle | None = None
 
@@ -167,8 +167,8 @@ class LineShare:
 class Standstill:
     """Detects that the gateway did not run for more than MOST_AGE_S, and then refuses writes for SETTLE_S.
 
-    For example, the computer may have slept. Writes that arrive after such a standstill may be old, and a
-    Modbus request contains no time that would show it.
+    For example, the computer may have slept. Writes that arrive afterwards may be old, and a Modbus
+    request contains no time that would show it.
 
     `clock` returns CLOCK_BOOTTIME in ns.
     """

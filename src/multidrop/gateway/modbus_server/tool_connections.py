@@ -44,7 +44,7 @@ class End(Protocol):
 
 
 class Terminal:
-    """A pseudo-terminal that tools open through a symbolic link.
+    """A pseudo-terminal that vendors' PC tools open through a symbolic link.
 
     This object keeps the tool's side open, so that the pseudo-terminal still exists after a tool has closed
     it. The baud rate and format that a tool sets have no effect. A lock on a file beside the link shows that
@@ -130,7 +130,7 @@ def is_ours(link: Path) -> bool:
 
 
 class Connection:
-    """A tool's TCP connection."""
+    """The TCP connection of a vendor's PC tool."""
 
     def __init__(self, peer: socket.socket, address: str) -> None:
         self.address = address
@@ -164,7 +164,7 @@ class Connection:
 
 
 class RequestCutter:
-    """Collects a tool's bytes and returns whole requests.
+    """Collects the bytes that a PC tool sends, and returns whole requests.
 
     Source: MODBUS over Serial Line V1.02, section 2.5.1. On a serial line, silence separates frames. The
     silence is lost in a pseudo-terminal and in TCP, so a frame is recognised by its length and checksum.

@@ -60,14 +60,13 @@ RTU_EXAMPLE = 'rtu = { hall = "127.0.0.1:4001" }'
 LEAST_TIMEOUT_S, MOST_TIMEOUT_S = 0.05, 10.0
 _TEXT = {"type": "string", "minLength": 1}
 WAY = "tool"
-# limits of the tools' share of a line's time: the first on a line that polling uses fully, the second on an
-# idle line
+# limits of the PC tools' share of a line's bus time: on a line that polling uses fully, and on an idle line
 LEAST_SHARE, MOST_SHARE = 0.1, 0.5
 MOST_TOOLS = 8  # limit of TCP connections to one line
-# pause, in s, between two reads from a tool, so that one tool cannot keep the event loop busy
+# pause, in s, between two reads from a PC tool, so that it cannot keep the event loop busy
 PAUSE_S = 0.005
 REST_S = 0.2  # in s: an incomplete request is dropped if no byte arrives for this long
-PLAN_S = 60.0  # time limit, in s, for computing how much of a line's time polling takes
+PLAN_S = 60.0  # time limit, in s, for computing the share of bus time that polling uses
 IDLE_S = 300.0  # in s: a TCP connection without a request for this long is closed
 SWEEP_S = 1.0  # interval, in s, of checking for idle connections
 # the answer to a stop waits for the motor, and a read waits for the line, for at most this share of `timeout`
@@ -409,7 +408,7 @@ class ToolPorts:
         self._terminals: dict[str, Terminal] = {}
         self._listeners: dict[str, socket.socket] = {}
         self._at_terminals: list[Tool] = []
-        self._tools: dict[str, list[Tool]] = {}  # tools that are connected over TCP, by line
+        self._tools: dict[str, list[Tool]] = {}  # PC tools that are connected over TCP, by line
 
     def listen(self) -> None:
         """Open all ports, or none. Raises OSError for the first port that cannot be opened."""
@@ -436,7 +435,7 @@ class ToolPorts:
                 self._sweep(tools, loop.time())
 
     def adopt(self, plant: Plant) -> None:
-        """Continue with another plant; tools stay connected."""
+        """Continue with another plant. PC tools stay connected."""
         self._plant = plant
         before, self.lines = self.lines, {}
         for tools in before.values():
@@ -447,7 +446,7 @@ class ToolPorts:
                 supervisor().start("tool share", self._learn_share(self.lines[line.name], line))
 
     async def _learn_share(self, tools: ToolLine, line: PlantLine) -> None:
-        """Set the tools' share of the line's time to half of the share that polling leaves."""
+        """Give the PC tools half of the line's bus time that polling leaves."""
         used = await supervisor().within("tool share", PLAN_S, partial(utilisation_of, self._plant, line))
         tools.share.share = min(MOST_SHARE, max(LEAST_SHARE, (1 - used) / 2))
 

@@ -29,7 +29,7 @@ from multidrop.supervisor import Hung, supervisor
 MOST_AGE_MS = round(MOST_AGE_S * 1e3)
 MOST_AHEAD_MS = 2_000  # in ms: how far a sender's clock may be ahead of the gateway's
 MOST_COMMANDS = 16  # limit of concurrent commands; stops are not counted
-REMEMBERED = 1_000  # number of newest commands that are remembered, to recognise copies
+KEPT_COMMANDS = 1_000  # number of newest commands that are kept, to recognise copies
 
 # a function that is called with the drive, the command's text, its result and its id
 Report = Callable[[str, str, CommandResult, str], None]
@@ -399,7 +399,7 @@ class BrokerCommands:
         self._caller = caller
         self._utc_ms = utc_ms
         self._report = report
-        self._came: deque[object] = deque(maxlen=REMEMBERED)
+        self._came: deque[object] = deque(maxlen=KEPT_COMMANDS)
         self._under_way = 0
         self._stops = JoinedStops()
 
