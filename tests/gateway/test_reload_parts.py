@@ -62,7 +62,7 @@ def status_of(port: int, unit: int) -> list[int]:
 IN_EFFECT = {"done": True, "text": "plant.toml is in effect", "mistakes": [], "restart": []}
 
 
-def test_reloads_start_and_change_and_end_the_modbus_server(gateway: Served) -> None:
+def test_a_reload_can_start_change_or_end_the_modbus_server(gateway: Served) -> None:
     first, second = free_port(), free_port()
     assert reload(gateway, MODBUS.format(first, 21)) == IN_EFFECT
     until(lambda: status_of(first, 21) == [3])
@@ -162,7 +162,7 @@ def test_a_slow_part_does_not_delay_a_stop(gateway: Served, monkeypatch: pytest.
 
 
 @pytest.mark.long
-def test_reloads_start_and_change_and_end_the_history(gateway: Served, tmp_path: Path) -> None:
+def test_a_reload_can_start_change_or_end_the_history(gateway: Served, tmp_path: Path) -> None:
     assert gateway.get("/api/export?from=0&to=1&series=pump-1.status").status == 404
     for folder in ("first", "second"):
         assert reload(gateway, f'[serve.history]\nfolder = "{folder}"\n') == IN_EFFECT
@@ -175,7 +175,7 @@ def test_reloads_start_and_change_and_end_the_history(gateway: Served, tmp_path:
 
 
 @pytest.mark.slow
-def test_reloads_start_and_change_and_end_mqtt(gateway: Served, tmp_path: Path) -> None:
+def test_a_reload_can_start_change_or_end_mqtt(gateway: Served, tmp_path: Path) -> None:
     require_module("paho.mqtt.client")
     with mosquitto(tmp_path) as broker, closing(Listener(broker)) as heard:
 
@@ -294,7 +294,7 @@ async def test_a_drive_that_a_reload_adds_is_stopped_as_soon_as_it_is_attached()
     assert lines.begun == [None, new]
 
 
-async def test_without_a_reload_a_stop_stops_only_the_named_drives() -> None:
+async def test_only_the_named_drives_are_stopped_without_a_reload() -> None:
     lines = Lines(plant_of(PUMP, FAN))
     assert told(await stop_meant(lines, ["fan", "nobody"], lines.stop)) == {"fan": FAN}
     assert lines.begun == [FAN, None]

@@ -93,7 +93,9 @@ def test_a_gateway_has_exactly_the_expected_tasks_and_threads(gateway: Served) -
 
 
 @pytest.mark.parametrize("name", usually("polling", *sorted(TASKS - {"web", "polling"})))
-def test_stops_outlive_any_killed_task(gateway: Served, name: str, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_stop_continues_whichever_task_is_killed(
+    gateway: Served, name: str, caplog: pytest.LogCaptureFixture
+) -> None:
     assert dead(gateway) == {}
     in_loop(gateway.loop, lambda found: found.kept[name].cancel())
     until(lambda: dead(gateway) == {name: "it was cancelled"})
@@ -321,7 +323,7 @@ async def test_the_supervisor_raises_an_error_if_no_thread_can_start(monkeypatch
     assert supervisor().under_way == []
 
 
-def test_function_in_time_returns_a_result_or_raises_hung_after_the_limit() -> None:
+def test_work_with_a_time_limit_returns_its_result_or_raises_hung() -> None:
     go_on = threading.Event()
 
     def fail() -> None:

@@ -104,18 +104,18 @@ class Commands:
         self.may = may
         self.withheld = ""  # why all commands except stops are refused now; "" if commands are accepted
         self._on_reset = on_reset
-        # by drive: number of commands, other than stops, that can end a motor's run
+        # number of commands, other than stops, that can end a motor's run, by drive
         self._halts: Counter[str] = Counter()
-        self._jogging: Counter[str] = Counter()  # by drive: jogs in progress
+        self._jogging: Counter[str] = Counter()  # jogs in progress, by drive
         self._lines = lines
         self.called = 0  # number of commands accepted so far
-        self._under_way: Counter[str] = Counter()  # by line: writes in progress
-        self.stops: Counter[str] = Counter()  # by drive: number of stops called
-        # by drive: when its latest stop was called (CLOCK_BOOTTIME, ns)
+        self._under_way: Counter[str] = Counter()  # writes in progress, by line
+        self.stops: Counter[str] = Counter()  # number of stops called, by drive
+        # time at which a drive's latest stop was called (CLOCK_BOOTTIME, ns), by drive
         self._stopped_ns: dict[str, int] = {}
         self._repeated = {verb: RepeatedStops(partial(stop_drive_by, verb)) for verb in STOPPING}
         self._repeated["stop"] = RepeatedStops()
-        # by drive: when its latest command, including stops, ended (CLOCK_MONOTONIC, ns)
+        # time at which a drive's latest command or stop ended (CLOCK_MONOTONIC, ns), by drive
         self._ended_ns: dict[str, int] = {}
         self.plant_ns: int | None = None  # when the plant file was last reloaded (CLOCK_BOOTTIME, ns)
 
@@ -440,7 +440,7 @@ def _used(call: re.Match[str]) -> str:
 # ---- the commands of a gateway whose lines are polled by a fleet ----
 
 NOT_STARTED = "the stop was NOT sent: the fleet's part has not started; use the hard-wired stop"
-WHOLE = "the fleet"  # in the answer to a stop: the key of the result for the whole fleet
+WHOLE = "the fleet"  # key of the result for the whole fleet in the answer to a stop
 
 
 class FleetStops(Commands):

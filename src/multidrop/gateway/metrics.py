@@ -37,7 +37,7 @@ class BaseUnit(NamedTuple):
     factor: float = 1.0
 
 
-UNITS = {  # by unit of a register: the unit of its metric
+UNITS = {  # units of metrics, by the unit of the register
     "Hz": BaseUnit("hertz"),
     "kHz": BaseUnit("hertz", 1e3),
     "A": BaseUnit("amperes"),

@@ -127,12 +127,12 @@ class LiveParts:
 
     def __init__(self, host: PartHost) -> None:
         self.feeds: dict[str, Part] = {}
-        self.dead: dict[str, str] = {}  # by part that could not start: the reason
+        self.dead: dict[str, str] = {}  # reasons why parts could not start, by part
         self.pending: dict[str, Building] = {}
         self._host = host
         self._settings: dict[str, Any] = {}
         self._built: dict[str, Building] = {}  # parts that are being built, or are built but not started
-        # by part that the present reload has closed: its previous settings
+        # previous settings of parts that the present reload has closed, by part
         self._replaced: dict[str, Any] = {}
 
     def source(self) -> Any:

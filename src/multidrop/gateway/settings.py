@@ -31,7 +31,7 @@ LISTEN = "127.0.0.1:8750"
 MOST_SECRET = 4096  # limit, in bytes, of a file that contains a secret
 AUDIT_S = 2.0  # time limit, in s, for checking the disk of the audit log
 HOST = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,251}[A-Za-z0-9])?")
-EXAMPLES = {  # by type: an example value for error messages
+EXAMPLES = {  # example values for error messages, by type
     bool: "true",
     int: "10",
     float: "1.5",

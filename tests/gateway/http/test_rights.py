@@ -208,7 +208,7 @@ def test_only_the_gateways_own_page_may_be_the_origin(case: tuple[str, str, tupl
     assert names.has_origin(origin, host, schemes) is ORIGINS[case]
 
 
-def test_stops_from_the_gateways_own_page_and_from_programs_are_sent(open_gateway: Served) -> None:
+def test_a_stop_from_the_gateways_own_page_or_a_program_is_sent(open_gateway: Served) -> None:
     port = open_gateway.gateway.port
     before = open_gateway.gateway.commands.called
     for headers in (

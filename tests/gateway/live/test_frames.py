@@ -79,7 +79,9 @@ async def test_changes_between_two_messages_are_computed_once_for_all_viewers(
     assert compared == [1]
 
 
-async def test_at_most_five_frames_are_made_per_second(frames: Frames, clock: Clock, made: list[int]) -> None:
+async def test_at_most_five_messages_to_the_page_are_made_per_second(
+    frames: Frames, clock: Clock, made: list[int]
+) -> None:
     seen = -1
     for _ in range(1000):  # 10 s with a change every 10 ms
         clock.now += 0.01
@@ -95,7 +97,9 @@ async def test_at_most_five_frames_are_made_per_second(frames: Frames, clock: Cl
     assert 45 <= len(made) <= 51
 
 
-async def test_rows_too_early_for_a_frame_appear_in_the_next(frames: Frames, clock: Clock) -> None:
+async def test_rows_that_arrive_before_a_message_is_due_appear_in_the_next(
+    frames: Frames, clock: Clock
+) -> None:
     """The next message to the page is made even if no further rows arrive."""
     first = await frames.after(-1)
     assert first is not None
@@ -158,7 +162,9 @@ plants = st.fixed_dictionaries(
 
 
 @given(plants, plants)
-def test_changes_to_the_old_frame_give_the_new_one(before: dict[str, Any], now: dict[str, Any]) -> None:
+def test_changes_applied_to_the_old_message_give_the_new_one(
+    before: dict[str, Any], now: dict[str, Any]
+) -> None:
     said = changes(before, now)
     assert merged(before, said) == now
     assert changes(before, merged(before, said)) == said
@@ -196,7 +202,7 @@ async def view(pictures: list[tuple[dict[str, Any], int]], begin: int) -> None:
 
 @pytest.mark.slow
 @given(st.lists(st.tuples(plants, st.integers(0, 9)), min_size=2, max_size=12), st.integers(0, 2**32))
-def test_a_viewer_may_skip_frames(pictures: list[tuple[dict[str, Any], int]], begin: int) -> None:
+def test_a_viewer_may_skip_messages(pictures: list[tuple[dict[str, Any], int]], begin: int) -> None:
     """The frames' revision number changes in the middle of the run."""
     asyncio.run(view(pictures, begin))
 
@@ -235,7 +241,9 @@ async def test_too_many_viewers_get_an_error(frames: Frames, monkeypatch: pytest
     assert json.loads(sent[1]["body"]) == {"error": "too many viewers; the limit is 0"}
 
 
-def test_frames_are_made_after_the_alarm_check(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_messages_to_the_page_are_made_after_the_alarm_check(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """At most every 0.2 s, the gateway checks drives for alarms and then makes a message to the page."""
     gateway = Gateway(written(tmp_path), ServeSettings(port=0))
     gateway.listener.close()

@@ -443,7 +443,7 @@ def test_only_scaled_values_have_a_unit(model: str) -> None:
             assert (register["at_least"], register["at_most"]) == (known.at_least, known.at_most)
 
 
-def test_the_common_block_has_no_number_for_values_of_unknown_scale() -> None:
+def test_the_registers_common_to_all_drives_have_no_value_of_unknown_scale() -> None:
     delixi, che = DelixiModbus(1, name="fan"), InvtCHE(2, name="pump", maximum_frequency=50)
     names = ("output_frequency", "output_current")
     drives = [polled(drive, [drive.registers[name] for name in names]) for drive in (delixi, che)]

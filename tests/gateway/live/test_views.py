@@ -190,7 +190,7 @@ def test_viewing_a_silent_drive_reads_none_of_its_unpolled_registers(gateway: Se
 
 
 @pytest.mark.long
-def test_api_lines_returns_the_reply_delays_of_each_drive(gateway: Served) -> None:
+def test_the_http_route_of_lines_returns_the_reply_delays_of_each_drive(gateway: Served) -> None:
     until(lambda: gateway.get("/api/lines").json["hall"]["minutes"])
     line = gateway.get("/api/lines").json["hall"]
     assert line["lost"] is None
@@ -239,7 +239,7 @@ def test_a_drive_shows_the_eeprom_writes_of_its_own_port_address_and_family_only
 
 
 @pytest.mark.slow
-def test_gateway_ask_reads_the_words_at_any_address(gateway: Served) -> None:
+def test_the_gateway_can_read_words_at_any_address(gateway: Served) -> None:
     """Modbus masters need the words exactly as the drive stores them."""
     gateway.sims["pump-1"]["output_current"] = 12.3
 

@@ -538,7 +538,7 @@ async def flood(share: LineShare, line: PacedLine, seconds: float, clients: int 
 
 @pytest.mark.long
 @pytest.mark.parametrize("seconds", usually(0.03, 0.005, 0.7))
-async def test_a_flooding_client_gets_exactly_a_fifth_of_the_line_time(seconds: float) -> None:
+async def test_a_flooding_client_gets_exactly_a_fifth_of_the_bus_time(seconds: float) -> None:
     loop = asyncio.get_running_loop()
     begun = loop.time()
     share, line = LineShare(), PacedLine(seconds)

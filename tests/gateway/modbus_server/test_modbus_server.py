@@ -233,7 +233,7 @@ def test_a_failed_read_has_its_exception_code(gateway: Gateway, failure: Excepti
 
 
 @pytest.mark.slow
-def test_reads_beyond_the_clients_share_of_line_time_are_answered_busy(gateway: Gateway) -> None:
+def test_reads_beyond_the_clients_share_of_bus_time_are_answered_busy(gateway: Gateway) -> None:
     gateway.hub.values.clear()
     gateway.line.seconds = 0.6  # three times BURST_S, the bus time that clients may use at once
     with gateway.client() as client:
@@ -523,7 +523,7 @@ def block(gateway: Gateway, unit: int = 1, function: int = 3) -> list[int]:
 UNKNOWN = [0x8000, 0]
 
 
-def test_the_common_register_block_contains_the_values_of_a_running_drive(gateway: Gateway) -> None:
+def test_the_registers_common_to_all_drives_have_the_values_of_a_running_drive(gateway: Gateway) -> None:
     gateway.hub.states["mill"] = "runs"
     gateway.hub.values.update(
         {("mill", "output_frequency"): 49.99, ("mill", "output_current"): 12.3, ("mill", "setpoint"): -5.0}
@@ -541,7 +541,7 @@ def test_the_common_register_block_contains_the_values_of_a_running_drive(gatewa
     assert block(gateway)[2:4] == [2, 0x49F0]  # 150000 has two words
 
 
-def test_unknown_values_in_the_common_register_block_read_as_reserved_numbers(gateway: Gateway) -> None:
+def test_unknown_values_in_the_common_registers_are_reserved_numbers(gateway: Gateway) -> None:
     gateway.hub.values.clear()
     assert block(gateway) == [0, 0xFFFF, *UNKNOWN, *UNKNOWN, *UNKNOWN, 0xFFFF, 0xFFFF, 0]
     gateway.hub.states["mill"] = "silent"
@@ -579,7 +579,7 @@ def test_a_read_is_refused_if_only_a_part_of_it_is_in_the_common_registers(gatew
         assert client.ask(1, 3, BLOCK - 1, 18).code == 2
 
 
-def test_drives_of_every_family_have_the_common_register_block(gateway: Gateway) -> None:
+def test_drives_of_every_family_have_the_registers_common_to_all_drives(gateway: Gateway) -> None:
     for unit, drive in enumerate(("mill", "meter", "pump", "belt"), 1):
         gateway.hub.states[drive] = "runs"
         assert block(gateway, unit)[0] == 2

@@ -208,7 +208,7 @@ def test_each_exception_code_is_in_a_table_of_the_documentation() -> None:
     assert set(rows("Exceptions")) == {f"{code:02X}" for code in ModbusCode} | {"others"}
 
 
-def test_the_common_register_block_has_the_layout_in_the_documentation() -> None:
+def test_the_registers_common_to_all_drives_have_the_documented_layout() -> None:
     offsets = [int(address.rstrip("H"), 16) - ModbusSettings().common for address in rows("The common block")]
     layout = words
     assert offsets == [
@@ -305,7 +305,7 @@ def test_address_0_is_reported_as_an_invalid_unit_id() -> None:
     }
 
 
-def test_a_common_register_block_that_overlaps_registers_is_reported() -> None:
+def test_an_overlap_of_own_and_common_registers_is_reported() -> None:
     class Parameters(Drive):
         frequency_source = setting(0xF003)
 
@@ -315,7 +315,7 @@ def test_a_common_register_block_that_overlaps_registers_is_reported() -> None:
     Units(plant, ModbusSettings(common=0xE000))
 
 
-def test_no_family_has_registers_in_the_address_range_of_the_common_register_block() -> None:
+def test_no_family_has_registers_at_the_default_addresses_of_the_common_registers() -> None:
     families = [find_model(name) for name in MODELS] + [load_family(path) for path in FAMILIES.glob("*.toml")]
     assert len(families) > 10
     common = set(ModbusSettings().common_addresses)

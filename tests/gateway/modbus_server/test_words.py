@@ -129,7 +129,7 @@ def test_register_words_can_be_computed_from_each_float_other_than_zero(number: 
 
 
 @table("value", [math.inf, -math.inf, math.nan, 1e300, 0.3, -1, 65536, 2**70])
-def test_no_words_are_computed_for_a_value_that_the_register_cannot_hold(value: float) -> None:
+def test_no_register_words_are_computed_for_a_value_that_does_not_fit(value: float) -> None:
     assert exact_data(declared(), value) is None
 
 
@@ -142,7 +142,7 @@ def test_no_words_are_computed_for_a_value_that_the_register_cannot_hold(value: 
         {"invalid": 5},  # the raw count that means "no value"
     ],
 )
-def test_no_words_are_computed_for_a_format_that_leaves_bits_undefined(details: dict[str, Any]) -> None:
+def test_no_register_words_are_computed_for_a_format_with_undefined_bits(details: dict[str, Any]) -> None:
     assert exact_data(declared(**details), 5.0) is None
 
 
@@ -245,7 +245,7 @@ def test_a_modbus_client_gets_no_value_polled_before_a_write() -> None:
     assert read(3, 1, 1, since_ns=NOW + 1) is Unavailable.STALE
 
 
-def test_of_two_registers_at_the_same_address_the_newest_value_is_used() -> None:
+def test_the_newest_of_two_values_at_the_same_address_is_used() -> None:
     assert read(3, 0, 1, again=FakeRow(NOW, 14.49)) == [1449]
     assert read(3, 0, 1, speed=FakeRow(NOW, None)) == [1450]
 

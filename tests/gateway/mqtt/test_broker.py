@@ -371,7 +371,7 @@ class HeldCommands:
         return {"pump-1": CommandResult(CommandOutcome.DONE, "stopped")}
 
 
-async def test_concurrent_commands_from_a_broker_are_limited_and_stops_are_not() -> None:
+async def test_the_limit_of_concurrent_broker_commands_lets_stops_pass() -> None:
     told: list[tuple[str, str]] = []
     commands: Any = HeldCommands()
     orders = BrokerCommands(
@@ -441,7 +441,7 @@ def test_nats_reports_a_lost_gateway(broker: RunningBroker, listener: Listener, 
 
 @pytest.mark.slow
 @on_nats
-def test_delayed_and_repeated_commands_over_nats_are_refused_and_stops_are_not(
+def test_only_a_stop_over_nats_may_be_delayed_or_repeated(
     broker: RunningBroker, listener: Listener, start: Start
 ) -> None:
     def told() -> Any:

@@ -47,7 +47,7 @@ def node(broker: Broker, host: Host, tmp_path: Path) -> Iterator[tuple[Any, Runn
     running.close()
 
 
-def test_a_node_sends_births_data_and_deaths_of_its_drives(host: Host, node: tuple[Any, Running]) -> None:
+def test_a_node_publishes_certificates_and_data_of_its_drives(host: Host, node: tuple[Any, Running]) -> None:
     known, running = node
     birth = host.values(host.wait_for("NBIRTH"))
     assert birth == {"bdSeq": 0, "Node Control/Rebirth": False}
@@ -99,7 +99,7 @@ def test_a_register_named_fault_does_not_hide_the_fault_metric(tmp_path: Path, f
     assert len({metric.alias for metric in birth.metrics}) == 3
 
 
-def test_a_birth_has_the_units_of_metrics(host: Host, node: tuple[Any, Running]) -> None:
+def test_a_birth_certificate_has_the_units_of_metrics(host: Host, node: tuple[Any, Running]) -> None:
     birth = host.wait_for("DBIRTH", "pump-1")
     units = {
         metric.name: dict(
@@ -140,7 +140,9 @@ def test_sequence_numbers_of_messages_restart_at_0_after_255(host: Host, node: t
     assert host.seq < 256
 
 
-def test_a_rebirth_command_repeats_all_births(broker: Broker, host: Host, node: tuple[Any, Running]) -> None:
+def test_a_rebirth_command_repeats_all_birth_certificates(
+    broker: Broker, host: Host, node: tuple[Any, Running]
+) -> None:
     host.wait_for("DBIRTH", FAN.name)
     command(broker, ROOT.format("NCMD"), name="Node Control/Rebirth", boolean_value=True, datatype=11)
     assert host.values(host.wait_for("NBIRTH"))["bdSeq"] == 0
@@ -157,7 +159,7 @@ def test_a_new_connection_has_the_next_bdseq(host: Host, node: tuple[Any, Runnin
     host.wait_for("DBIRTH", "pump-1")
 
 
-def test_of_several_pending_births_and_deaths_of_a_drive_only_the_last_is_sent(tmp_path: Path) -> None:
+def test_only_the_last_pending_birth_or_death_certificate_of_a_drive_is_sent(tmp_path: Path) -> None:
     known, sent, is_open = inside(tmp_path), [], [True]
 
     def send(message: Publication) -> int | None:
@@ -188,7 +190,9 @@ def test_of_several_pending_births_and_deaths_of_a_drive_only_the_last_is_sent(t
     assert [kind for kind, _ in sent[4:]] == ["DBIRTH", "DDATA"]
 
 
-def test_closing_the_gateway_sends_a_death(broker: Broker, host: Host, tmp_path: Path) -> None:
+def test_closing_the_gateway_publishes_a_death_certificate(
+    broker: Broker, host: Host, tmp_path: Path
+) -> None:
     require_module("paho.mqtt.client")
     settings = MqttSettings(broker.address, sparkplug="works", node="line")
     running = Running(build(settings, inside(tmp_path)))
@@ -404,7 +408,9 @@ def test_a_failed_start_of_the_mqtt_part_leaves_no_spool_open(tmp_path: Path) ->
 
 
 @pytest.mark.slow
-def test_late_rows_are_historical(broker: Broker, host: Host, row_node: tuple[Any, Any, Running]) -> None:
+def test_late_rows_are_published_as_historical_values(
+    broker: Broker, host: Host, row_node: tuple[Any, Any, Running]
+) -> None:
     _, part, _ = row_node
     host.wait_for("DBIRTH", FAN.name)
     for one in part._brokers:
@@ -424,7 +430,9 @@ def test_late_rows_are_historical(broker: Broker, host: Host, row_node: tuple[An
 
 
 @pytest.mark.slow
-def test_a_birth_precedes_historical_values(host: Host, row_node: tuple[Any, Any, Running]) -> None:
+def test_a_birth_certificate_is_published_before_historical_values(
+    host: Host, row_node: tuple[Any, Any, Running]
+) -> None:
     known, part, running = row_node
     host.wait_for("DBIRTH", FAN.name)
     known.hub.states["pump-1"] = "silent"

@@ -158,7 +158,9 @@ def test_a_stops_result_does_not_replace_another_stops_question(opened: Opener, 
     assert [body for _, body in gateway.posts] == [{"drives": ["pump-1"]}, {"drives": None}]
 
 
-def test_stops_work_if_another_script_of_the_page_fails_to_load(opened: Opener, gateway: FakeGateway) -> None:
+def test_stop_all_works_if_another_script_of_the_page_fails_to_load(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     """If one view cannot be loaded, no view is shown, but stops work."""
     broken = ("**/page/views/drives/table.js", "**/page/vendor/*", "**/api/frame*")
     page = opened(live=False, prepare=aborting(*broken))

@@ -190,7 +190,7 @@ class RowForwarder(RetryingSender):
         self._position = SpoolPosition(max(0, state.oldest - 1))
         self._is_asked = False
         self._accepted = 0  # messages sent since the gateway's start
-        # by message number: how many messages had been sent when the receiver first refused this one
+        # number of messages sent when the receiver first refused a message, by number of that message
         self._refusals: dict[int, int] = {}
         spool.acknowledge(self._position.newest)
         spool.on_message = self.announce

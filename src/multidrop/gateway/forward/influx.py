@@ -86,7 +86,7 @@ def line_protocol(rows: Any, measurement: str) -> bytes:
     written twice, InfluxDB replaces the point by the same point.
     """
     name, lines = _escaped(measurement, ", "), []
-    # by drive, register and unit: the start of a line, without its value and time
+    # start of a line, without its value and time, by drive, register and unit
     heads: dict[tuple[str, str, str | None], str] = {}
     for time_ns, drive, register, value, status, unit in listed(rows):
         head = heads.get((drive, register, unit))

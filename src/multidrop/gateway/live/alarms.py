@@ -116,9 +116,10 @@ class Alarms:
         self._lasting: dict[tuple[str, str, str], Alarm] = {}
         self._ended: deque[Alarm] = deque(maxlen=MOST_ENDED)
         self._known: set[tuple[str, str]] = set()  # lines and drives whose state was seen before
-        # by drive: how many commands that end a run had been sent when the motor was first seen running
+        # by drive, when its motor was first seen running: number of commands so far that can end a run
         self._runs: dict[str, int] = {}
-        self._stands: dict[str, int] = {}  # by drive: when its motor was first seen at rest after running
+        # time at which a motor was first seen at rest after running, by drive
+        self._stands: dict[str, int] = {}
         self.begun = 0  # number of alarms that started so far
 
     # ---- observations ----

@@ -30,7 +30,7 @@ PARAMETERS_S = 3600.0  # time limit, in s, of reading all parameters of a drive
 PARAMETER_SHARE = 3  # the pause after a block of parameters is this many times the duration of its read
 MOST_PAUSE_S = 1.0  # limit of that pause, in s
 
-# by register: its value or None, the time of the read (UTC, ms), "ok" or the reason of the failure
+# by register: a value or None, the time of its read (UTC, ms), and "ok" or the reason of the failure
 ReadValues = dict[str, list[Any]]
 _log = logging.getLogger("multidrop.gateway")
 
@@ -50,7 +50,7 @@ class SideReads:
     ) -> None:
         self._bus = bus
         self._is_there = is_there
-        # by line: a lock that makes the line's reads wait for each other
+        # locks that make the reads on one line wait for each other, by line
         self._turns: dict[str, asyncio.Lock] = {}
         self._clock = clock
         self._utc_ms = utc_ms
@@ -145,7 +145,7 @@ class Identities:
         self._bus = bus
         self._is_there = is_there
         self._fail = fail
-        self._refused: dict[str, str] = {}  # by drive: the reason of the failed check that was logged last
+        self._refused: dict[str, str] = {}  # reason of the failed check that was logged last, by drive
 
     async def run(self) -> None:
         """Check all drives in rounds, forever, because drives may answer again and ports may be reopened."""

@@ -290,8 +290,8 @@ class SeenFrames:
     def __init__(self, clock: Callable[[], int], commands: Commands) -> None:
         self.clock = clock
         self._commands = commands
-        self._made: dict[int, int] = {}  # by message number: when the message was made (ns)
-        # by number of a message to the page: commands that were admitted from senders with this message
+        self._made: dict[int, int] = {}  # time at which a message was made (ns), by its number
+        # commands admitted from senders that have a message to the page, by number of this message
         self._came: dict[int, set[object]] = {}
 
     def note(self, n: int) -> None:

@@ -178,8 +178,8 @@ class Hub:
         self.time = 0  # request time of the newest row, UTC in ns
         self._time_ns = 0  # the same as monotonic time, because UTC may be set back
         self.taken = 0  # number of batches received
-        self.unopened: dict[str, str] = {}  # by line: why its port could not be opened
-        self.stalled: dict[str, str] = {}  # by line: why its open port accepts no bytes
+        self.unopened: dict[str, str] = {}  # why a port could not be opened, by line
+        self.stalled: dict[str, str] = {}  # why an open port accepts no bytes, by line
         # rows of a register; key: one number made of a batch's drive code and register code;
         # None: the register is not in the plant
         self._cells: dict[int, RegisterRows | None] = {}

@@ -22,15 +22,15 @@ class RecentStatistics:
     def __init__(self, plant: Plant) -> None:
         self.newest: Reading = {}
         self._recent: deque[tuple[float, Reading]] = deque()
-        self._minute: dict[str, LineStatistics | None] = {}  # by line: statistics over the last minute
+        self._minute: dict[str, LineStatistics | None] = {}  # statistics over the last minute, by line
         self._due = 0.0  # monotonic time, in s, at which the figures of the last minute are refreshed next
         self._drives: dict[str, dict[str, Any]] = {}
-        # by line: figures from the newest reading of the counters
+        # figures from the newest reading of the counters, by line
         self._figures: dict[str, dict[str, Any]] = {}
         # one reading of the counters per minute, with its time: monotonic in s, and UTC in ms. Only the last
         # two, because readings are large.
         self._minutes: deque[tuple[float, int, Reading]] = deque(maxlen=2)
-        # by line: figures of each of the last 60 whole minutes
+        # figures of each of the last 60 whole minutes, by line
         self._hours: dict[str, deque[dict[str, Any]]] = {}
         self.adopt(plant)
 

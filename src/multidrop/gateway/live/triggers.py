@@ -150,7 +150,7 @@ class _Conditions:
         }
         self._inputs = {series: slot for series, slot in self._channels.inputs.items() if series in needed}
         self._by_slot = {slot: name for name, slot in self._channels.slots.items()}
-        # by a batch's drive code and register code: the index of this register among the conditions' inputs
+        # index of a register among the inputs of the conditions, by the batch's drive code and register code
         self._slots: dict[tuple[int, int], int] = {}
         self._sizes = (0, 0)  # how many drive names and register names the newest batch has
         self._was: dict[int, bool] = {}  # whether each condition, by its index, was true before

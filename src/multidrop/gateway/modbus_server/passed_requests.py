@@ -224,7 +224,7 @@ class ClientWrites:
         self._common = common or range(0)
         self._common_stop = common.start + STOP if common else None
         self._stops = JoinedStops()
-        # by line: when the latest audit entry about a refused write was made
+        # time of the latest audit entry about a refused write, by line
         self._recorded: dict[str, float] = {}
 
     def begin(

@@ -156,9 +156,9 @@ def code_of(error: BaseException | None) -> int:
     return next((code for kind, code in _CODES if isinstance(error, kind)), ModbusCode.DEVICE_FAILURE)
 
 
-# by function: limit of the bits or words in one request (application protocol, 6.1 to 6.4)
+# limits of the bits or words in one request, by function (application protocol, 6.1 to 6.4)
 MOST_READ = {1: 2000, 2: 2000, 3: 125, 4: 125}
-# by function: limit of the bits or words in one request (application protocol, 6.11 and 6.12)
+# limits of the bits or words in one request, by function (application protocol, 6.11 and 6.12)
 MOST_WRITTEN = {0x0F: 1968, 0x10: 123}
 ADDRESSES = 0x10000
 

@@ -186,7 +186,7 @@ class Unit:
         self.common = CommonBlock(polled)
         self.channels = ChannelBlock(polled)
         self.stops = frozenset(_stop_writes(polled.drive))
-        # by Modbus function code: the addresses that it reads; 0: registers that no standard function reads
+        # readable addresses, by the Modbus function code that reads them; 0: no standard function reads them
         self._readable: dict[int, set[int]] = {code: set() for code in range(5)}
         self._gaps: list[tuple[int, range]] = []
         self._writable: dict[tuple[Carrier, int], Register[Any]] = {}

@@ -17,7 +17,7 @@ from multidrop.drive import SIGNED, Access
 from multidrop.gateway.live.hub import FAULT, RUNS, STANDS, STATES, digits_of
 
 DISCOVERY = "homeassistant"
-CLASSES = {  # by unit: the device_class of a sensor in Home Assistant
+CLASSES = {  # device_class of a sensor in Home Assistant, by unit
     "Hz": "frequency",
     "A": "current",
     "V": "voltage",

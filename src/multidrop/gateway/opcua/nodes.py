@@ -190,7 +190,7 @@ class PlantNodes:
     """
 
     def __init__(self, server: InternalServer) -> None:
-        # by id of a stop method's node: the drive that the method stops; None: all drives
+        # drive that a stop method stops, by the id of the method's node; None: all drives
         self.stops: dict[ua.NodeId, str | None] = {PLANT_STOP: None}
         self._session = server.isession
         self._space = server.aspace

@@ -123,7 +123,7 @@ class OpcUa:
         self._plant = context.plant
         self._adopted: Plant | None = None  # the plant whose nodes the server shows
         self._turn = 0  # number of intervals so far
-        # by drive and variable: the state that was passed to the server last
+        # state that was passed to the server last, by drive and variable
         self._seen: dict[str, dict[str, Any]] = {}
         # wrong tokens that were logged, so that each is logged once; used only in the server's thread
         self._wrong = Tokens()
