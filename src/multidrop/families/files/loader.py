@@ -183,9 +183,9 @@ def _base(given: Mapping[str, Any], place: TomlPlace) -> type[Drive]:
 def _check_inherited(
     base: type[Drive], document: Mapping[str, Any], declared: Declared, texts: Iterable[str], place: TomlPlace
 ) -> None:
-    """Report each declaration that has the name of a part of the extended built-in family.
+    """Report declarations with a name, an address or a section that the extended built-in family has itself.
 
-    It would replace that part, which might be a limit, or might prevent a start of the motor.
+    They would replace parts of the family, such as a limit, or a check that prevents a start of the motor.
     """
     if base not in MODELS.values():
         return

@@ -31,8 +31,8 @@ _BY_PROFILE = "set by the profile; leave it out"
 class Role:
     """What a profile requires of a register that it uses, such as `control`.
 
-    The register gets `values` and `harmless` from its role; a family does not declare them. `needed` is False
-    if a family may omit the register.
+    The profile sets `values` and `harmless` of the family's register. `needed` is False if a family may omit
+    the register.
     """
 
     access: tuple[Access, ...]
@@ -42,7 +42,7 @@ class Role:
     moves: bool | None = None
     units: tuple[str, ...] = ()  # allowed units; empty: any
     extra: tuple[str, ...] = ()  # names of bits that a family may add, because makes differ in these bits
-    renumbered: tuple[str, ...] = ()  # words that a family with its own numbers must have
+    renumbered: tuple[str, ...] = ()  # words that a family must list if it lists its own raw counts
     needed: bool = True
 
     @property
@@ -100,7 +100,7 @@ def role_errors(name: str, role: Role, register: Register[Any]) -> Iterator[str]
         wanted = " or a ".join(access.value for access in role.access)
         yield f"{name}: in this profile it is a {wanted}, not a {register.access.value}"
     for fact in ("harmless", "never_together", "moves", "never"):
-        if getattr(register, fact) not in (None, ()) and getattr(register, fact) != "":
+        if getattr(register, fact) not in (None, (), ""):
             yield f"{name}: {fact} is {_BY_PROFILE}"
     if role.is_word:
         yield from _word_errors(name, role, register)
