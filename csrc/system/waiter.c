@@ -49,16 +49,13 @@ static wait_function *best_wait(int epoll)
 
 struct md_waiter *md_waiter_new(void)
 {
-    struct md_waiter *waiter = malloc(sizeof *waiter);
-    if (!waiter)
-        return NULL;
-    waiter->epoll = epoll_create1(EPOLL_CLOEXEC);
-    if (waiter->epoll < 0) {
-        free(waiter);
-        return NULL;
+    struct md_waiter *waiter = calloc(1, sizeof *waiter);
+    if (waiter && (waiter->epoll = epoll_create1(EPOLL_CLOEXEC)) >= 0) {
+        waiter->wait = best_wait(waiter->epoll);
+        return waiter;
     }
-    waiter->wait = best_wait(waiter->epoll);
-    return waiter;
+    free(waiter);
+    return NULL;
 }
 
 void md_waiter_free(struct md_waiter *waiter)
