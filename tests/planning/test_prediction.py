@@ -146,7 +146,7 @@ def test_registers_without_a_period_get_the_line_time_that_others_leave() -> Non
     assert predict(asked(timed, 0.1)).utilisation == pytest.approx(load)
 
 
-def test_prediction_for_a_rate_that_is_too_high_is_the_rate_that_the_line_allows() -> None:
+def test_predicted_rate_is_at_most_the_rate_that_the_line_allows() -> None:
     drives = [Simple(address, format="8N1") for address in range(1, 5)]
     found = predict([each for drive in drives for each in asked(drive, 0.05)])
     assert found.utilisation == pytest.approx(8 * (OWN + SILENCE) / 0.05)

@@ -62,7 +62,7 @@ def test_polls_are_due_at_multiples_of_the_period_whenever_they_are_planned() ->
 def test_polls_missed_during_a_stall_are_counted_and_skipped() -> None:
     made = schedule(poll := job(period_ms=20))
     assert take(made, 0, 1) == [(poll, 0)]
-    assert take(made, 110, 1) == [(poll, 100)]  # the slots that started at 20, 40, 60 and 80 ms are over
+    assert take(made, 110, 1) == [(poll, 100)]  # the slots that started at 20, 40, 60 and 80 ms have ended
     assert poll.skipped == 4
     assert take(made, 111, 10) == [(poll, 120)]
 
@@ -368,7 +368,7 @@ def test_schedule_reserves_the_whole_timeout_for_a_request_to_a_silent_drive() -
     assert take(made, 60_000, 300) == [(dead, 0)]
 
 
-def test_reporting_the_same_failures_again_does_not_end_the_pause_of_a_drive() -> None:
+def test_a_pause_does_not_end_if_the_same_failures_are_reported_again() -> None:
     made = schedule(poll := job(1), job(2))
     for now in (0, 100):
         fail(made, 1, 2, now_ms=now)
@@ -431,7 +431,7 @@ def test_poll_that_is_removed_when_it_is_due_is_not_sent() -> None:
     assert take(made, 5, 100) == []
 
 
-def test_replacement_of_a_poll_keeps_its_turn_and_its_next_due_time() -> None:
+def test_a_poll_gets_the_turn_and_due_time_of_the_poll_it_replaces() -> None:
     jobs = [job(drive) for drive in range(4)]
     made = schedule(*jobs)
     assert [each for each, _ in take(made, 0, 10)] == jobs[:2]
@@ -559,7 +559,7 @@ class Operation(RuleBasedStateMachine):
         # number of slots that were reported as passed, because no request was sent
         self.passed: Counter[Job] = Counter()
         self.failures = dict.fromkeys(range(4), 0)
-        self.silent_until = dict.fromkeys(range(4), 0)  # by drive: until when a late reply may come
+        self.silent_until = dict.fromkeys(range(4), 0)  # time until which a late reply may come, by drive
 
     @rule(drive=st.integers(0, 3), period=st.none() | st.integers(5, 80), duration=st.integers(1, 10))
     def add(self, drive: int, period: int | None, duration: int) -> None:

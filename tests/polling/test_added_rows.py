@@ -60,7 +60,7 @@ def of(rows: list[Row], register: str) -> list[Row]:
     return [row for row in rows if row.register == register]
 
 
-def test_each_row_of_a_register_adds_a_row_of_the_channel_computed_from_it(port: str) -> None:
+def test_a_channel_has_a_row_for_each_row_of_its_register(port: str) -> None:
     rows = polled_rows(plant(line(port, pump(DOUBLE))))
     inputs, doubles = of(rows, "output_current"), of(rows, "double")
     value = proof(Toy(1), CURRENT)

@@ -100,7 +100,7 @@ OTHERS = (
 @pytest.mark.long
 @pytest.mark.parametrize("every", usually(None, 0.1, 0.08), ids=str)
 def test_adopting_other_lines_does_not_shift_requests_on_an_unchanged_line(every: float | None) -> None:
-    """The unchanged line's requests are sent at exactly the same times as without an adoption."""
+    """An unchanged line's requests are sent at exactly the same times as without a call of `adopt`."""
 
     def exchanges(*, adopts: bool) -> list[tuple[int, str, str]]:
         with clocked(hall(*pumps(every)), yard(*fans(every))) as made:
@@ -265,7 +265,7 @@ def test_a_plant_can_be_adopted_before_polling_starts() -> None:
 
 
 def calls_to_add_one_to(count: int) -> int:
-    """Return how many functions of `adoption` are called when one line is added to `count` lines."""
+    """Return how many functions of adoption.py are called when one line is added to `count` lines."""
     lines = [hall(toy(f"pump-{number}", 1), name=f"hall-{number}") for number in range(count)]
     calls = 0
 

@@ -298,7 +298,7 @@ def test_replaced_drives_stay_attached_during_stops(both: TwoLines, monkeypatch:
 def test_a_drive_can_be_stopped_until_its_new_name_is_free(
     both: TwoLines, monkeypatch: pytest.MonkeyPatch, is_circle: bool
 ) -> None:
-    """While the adoption waits for a stop on the other line, the drive's motor can still be stopped."""
+    """While `adopt` waits for a stop on the other line, the drive's motor can still be stopped."""
     hall, yard = both.hall(1), both.yard(1)
     names = ("fan-1", "pump-1" if is_circle else "fan-2")
     renamed = [

@@ -128,7 +128,7 @@ def test_duckdb_reads_a_batch() -> None:
     assert [Row(*row) for row in found] == EXAMPLE
 
 
-def test_numpy_reads_a_batch_with_misses_as_nan() -> None:
+def test_numpy_reads_missing_values_of_a_batch_as_nan() -> None:
     numpy = pytest.importorskip("numpy", reason="needs NumPy")
     taken = nanoarrow.Array(example())
     values = taken.child(5).to_pysequence(handle_nulls=nanoarrow.nulls_as_sentinel())
@@ -292,7 +292,7 @@ def test_the_time_of_a_row_is_a_datetime() -> None:
 
 
 def polled_batches() -> list[Batch]:
-    """Poll a drive that answers and one that does not; return batches with values and misses of both."""
+    """Poll a drive that answers and one that does not; return batches with all their rows."""
     with Simulator([Wire([EncodedDrive(Toy(1))], unpaced=True)]) as simulator:
         drives = [polled(Toy(at, name=f"pump-{at}"), [Toy.output_current, Toy.fault]) for at in (1, 2)]
         found: list[Batch] = []
@@ -307,7 +307,7 @@ def polled_batches() -> list[Batch]:
 
 
 @pytest.mark.slow
-def test_arrow_libraries_read_values_and_misses_of_a_poller() -> None:
+def test_arrow_libraries_read_all_values_and_missing_values() -> None:
     polars = pytest.importorskip("polars", reason="needs polars")
     batches = polled_batches()
     rows = [row for batch in batches for row in batch]
@@ -486,7 +486,7 @@ def test_the_wide_form_joins_no_rows_with_different_monotonic_times() -> None:
 
 
 def test_rows_after_a_restart_of_the_computer_are_last_in_the_wide_form() -> None:
-    """A restart sets the monotonic clock to 0. Without a restart, a late miss is sorted by its time."""
+    """A restart sets the monotonic clock to 0. Without a restart, a late row is sorted by its time."""
     hour = 3600.0
     before = [row(at, "pump", "a", at) for at in (hour, hour + 200, hour + 100)]
     after = [
@@ -497,7 +497,7 @@ def test_rows_after_a_restart_of_the_computer_are_last_in_the_wide_form() -> Non
     assert table.column("pump.a").to_pylist() == [hour, hour + 100, hour + 200, 7.0, 9.0]
 
 
-def test_a_miss_is_null_in_the_wide_form_and_replaces_no_value() -> None:
+def test_a_missing_value_is_null_in_the_wide_form_and_replaces_no_value() -> None:
     columns = Columns(4)
     assert add_rows(columns, block(0, 0), completion(SECOND, first_ns=SECOND, words=(100,)), UTC_0)
     assert add_miss(columns, block(0, 0), Status.NOT_ASKED, SECOND, UTC_0)

@@ -83,7 +83,7 @@ def test_a_drive_is_added_and_removed_while_others_are_polled(port: str, every: 
             assert "pump-2" not in poller.summary()["lines"]["line"]["drives"]
             first = len(seen.of("pump-1"))
             until(lambda first=first: len(seen.of("pump-1")) > first + QUEUED)
-            settled_ns = time.monotonic_ns()  # by now, all earlier requests are over
+            settled_ns = time.monotonic_ns()  # all earlier requests have ended
             until(lambda first=first: len(seen.of("pump-1")) > first + 2 * QUEUED)
             assert seen.last_asked_ns["pump-2"] < settled_ns
     assert {*seen.of("pump-1")} == {proof(Toy(1), CURRENT)}
@@ -150,12 +150,12 @@ def test_calls_of_a_detached_drive_raise_and_send_nothing(port: str) -> None:
             with pytest.raises(ValueError, match="pump-1 is not attached to this bus"):
                 do()
         again = bus.attach(Toy, address=1, name="pump-1")
-        assert bus.peer(again) is peer  # the peer that knows which late replies are due
+        assert bus.peer(again) is peer  # the core's record, which knows the late replies that may come
         assert peer.proofs is proofs  # the core may still be using them
 
 
 @pytest.mark.slow
-def test_a_drive_attached_at_a_used_address_expects_late_replies_to_the_old_one(port: str) -> None:
+def test_a_drive_at_a_used_address_expects_late_replies_of_the_old_drive(port: str) -> None:
     with Bus(port) as bus:
         gone = bus.attach(Toy, address=9)
         with pytest.raises(NoReply):
@@ -481,7 +481,7 @@ def test_an_invalid_rate_changes_nothing(two: ClockedLines) -> None:
     assert set(values(two.run(10)).values()) <= {99, 100, 101}
 
 
-def test_set_rate_of_another_drive_object_with_the_same_name_raises(two: ClockedLines) -> None:
+def test_set_rate_refuses_another_drive_object_of_the_same_name(two: ClockedLines) -> None:
     with pytest.raises(ValueError, match="pump-1 is not polled here"):
         two.poller.set_rate(toy(1), None, 1.0)
 

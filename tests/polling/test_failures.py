@@ -508,7 +508,7 @@ def test_batches_end_when_the_poller_is_closed(poller: Poller) -> None:
         taker = threading.Thread(target=take)
         taker.start()
         until(lambda: poller.summary()["samples"] > 20)
-    taker.join(30.0)  # ends long before the 60 s of `every` are over
+    taker.join(30.0)  # ends long before the 60 s of `every` have passed
     assert not taker.is_alive()
     assert len(rows) == counted(poller)
 

@@ -1,5 +1,5 @@
-"""Every fault on a line of every family: no value is misattributed, every miss has a reason, and polling
-recovers.
+"""Every fault on a line of every family: no value is misattributed, every missing value has a reason, and
+polling recovers.
 
 The tests run on a simulated clock, so that a seed reproduces its run. To run for hours, with new seeds:
 `HOSTILE_HOURS=2 pytest -m '' tests/polling/test_hostile_line.py -k hours`.
@@ -208,7 +208,7 @@ def poll(path: str, drives: list[PolledDrive], seconds: float) -> tuple[list[Row
 
 
 def check(rows: list[Row], drives: list[PolledDrive], summary: dict[str, Any]) -> None:
-    """Check that no value is misattributed, every miss has a valid reason, and the summary is complete."""
+    """Check that no value is misattributed, missing values have reasons, and the summary is complete."""
     truth = proofs(*drives)
     assert len(set(truth.values())) > len(drives)
     samples = [row for row in rows if row.value is not None]

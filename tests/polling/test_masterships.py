@@ -95,7 +95,7 @@ class Rows:
         until(lambda: status in self.statuses(drive))
 
     def settle_unpolled(self, drive: str) -> None:
-        """Wait until this drive has had several misses. By then, its earlier requests have ended."""
+        """Wait until several values of this drive are missing. Then its earlier requests have ended."""
         for _ in range(3):
             rows_of(self._poller)
             self.until(drive, NOT_MASTER)
@@ -116,7 +116,7 @@ def test_a_plant_is_polled_only_by_the_lines_master(mastership: Mastership, ever
         hold(mastership)
         rows.settle("pump", "fan")
         mastership.end()
-        rows.settle_unpolled("pump")  # by then, the drives have received all earlier requests
+        rows.settle_unpolled("pump")  # then the drives have received all earlier requests
         asked = [sim.counters.requests for sim in sims]
         rows_of(poller)
         rows.until("fan", NOT_MASTER)

@@ -341,7 +341,7 @@ def test_each_fault_of_a_reply_gives_rows_with_its_status(fault: str, pump: Simu
 
 
 @pytest.mark.slow
-def test_a_drive_that_answers_every_second_request_has_values_and_misses(pump: SimulatedDrive) -> None:
+def test_a_drive_that_answers_every_second_request_has_half_its_values(pump: SimulatedDrive) -> None:
     turns = itertools.cycle([True, False])
     wire = Faulty([pump], lambda reply: reply if next(turns) else b"", unpaced=True)
     with Simulator([wire]) as sim, Polling(line(sim.wires[0].path, polled(drive(), ONE))) as polling:
@@ -352,7 +352,7 @@ def test_a_drive_that_answers_every_second_request_has_values_and_misses(pump: S
 
 
 @pytest.mark.slow
-def test_a_silence_too_short_for_the_drive_causes_misses() -> None:
+def test_a_silence_that_is_too_short_for_the_drive_loses_values() -> None:
     """The drive needs a longer silence, and appends a request that comes too soon to the previous frame."""
     strict = simulated(Brisk(1, name="pump-1"))
     strict.needs_silence = True
@@ -582,7 +582,7 @@ def test_closing_a_poller_waits_for_exchanges_in_flight(
 def test_a_request_without_reply_when_polling_ends_has_a_row(
     responder: tuple[int, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A slot that is still queued has a row only if its time is over when polling ends."""
+    """A queued slot has a row only if it has already ended when polling ends."""
     monkeypatch.setattr(line_set, "ENDING_NS", 10_000_000)
     master, path = responder
     short = polled(Patient(2, name="pump-2"), [Patient.fault], 0.0002)
@@ -598,7 +598,7 @@ def test_a_request_without_reply_when_polling_ends_has_a_row(
 @pytest.mark.slow
 @pytest.mark.parametrize("leaves", ["the poll", "the drive"])
 def test_a_slot_not_over_when_polling_ends_has_no_row(responder: tuple[int, str], leaves: str) -> None:
-    """Such a slot does not count as a miss either."""
+    """Such a slot is not counted as a missing value either."""
     master, path = responder
     first = polled(Patient(1, name="pump-1"), [Patient.fault], 60.0)
     second = polled(Patient(2, name="pump-2"), [Patient.fault], 60.0)

@@ -1,4 +1,4 @@
-"""Requests that a drive does not answer as a whole are split, and an invalid value is a miss."""
+"""Requests that a drive does not answer as a whole are split, and an invalid value counts as missing."""
 
 from __future__ import annotations
 

@@ -259,7 +259,7 @@ def test_a_server_that_closes_idle_connections_costs_no_value() -> None:
 
 
 @pytest.mark.long
-def test_values_of_a_server_that_closes_each_connection_at_once_are_misses() -> None:
+def test_values_are_missing_if_a_server_closes_each_connection_at_once() -> None:
     """Many devices close a new connection at once if they already serve as many clients as they can."""
     with server(lambda nth, address: False, idle_s=0.0) as port:
         drive = polled(Scattered(1, name="pump"), [Scattered.registers["near"]], 0.1)

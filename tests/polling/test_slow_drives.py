@@ -40,7 +40,7 @@ FIRST, LATER = 8, 30  # s; values are counted in the first 8 s and in the 30 s a
 BACK = 45  # s; time limit until dead drives are polled again after they get power
 
 
-def test_the_row_of_a_slot_skipped_in_advance_appears_only_at_the_slots_time() -> None:
+def test_a_slot_skipped_in_advance_gets_its_row_only_when_it_is_due() -> None:
     """The poller decides in advance which slots of a silent drive it skips."""
     toy = Toy(1, name="pump-1")
     silent = simulated(toy)

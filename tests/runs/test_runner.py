@@ -436,10 +436,10 @@ class FarEnds:
     def __init__(self, test: TestRun, monkeypatch: pytest.MonkeyPatch) -> None:
         self.test = test
         self.sims: dict[str, Any] = {}
-        self.requests: dict[str, list[Message]] = {}  # by line
-        self.cause: dict[str, int] | None = None  # by line: number of requests at the call of `happen`
+        self.requests: dict[str, list[Message]] = {}  # received requests by line
+        self.cause: dict[str, int] | None = None  # number of requests at the call of `happen`, by line
         self.event: Callable[[FarEnds], object] | None = None  # called after two bus cycles of the first step
-        self._left: dict[str, int] = {}  # by line: number of requests until the event
+        self._left: dict[str, int] = {}  # number of requests until the event, by line
         self._monkeypatch = monkeypatch
         self._clock, self._ticked = 0.0, threading.Condition()
         self._due: dict[str, float] = {}  # simulated time of the next reply, by line
