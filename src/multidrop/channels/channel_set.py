@@ -89,7 +89,7 @@ class ChannelSet:
         self._values: list[Value] = [None] * size
         self._statuses = [UNSEEN] * size
         self._sent_ns = [0] * size
-        self._known_ns: dict[int, int] = {}  # by index: the monotonic time of the newest known value
+        self._known_ns: dict[int, int] = {}  # monotonic time of the newest known value, by index
         self._gaps: set[int] = set()  # indexes of channels for which a value is too old
         self._holds_ns = [round(hold_s * 1e9) for hold_s in series.holds_s]
         # UTC in ns of the newest value in the restored totals, by channel index

@@ -87,7 +87,7 @@ def plan(
     rates: dict[float | None, list[Register[Any]]] = {}
     for register, every in wanted:
         rates.setdefault(every, []).append(register)
-    # s that a request takes in addition to its characters
+    # seconds that a request takes in addition to its characters
     overhead = silence(drive) + (drive.response_delay if delay is None else delay)
     character = drive.settings.character
     found: list[Planned] = []
@@ -255,7 +255,7 @@ def _divisions(framing: Framing, neighbours: _Neighbours) -> tuple[_Division, ..
     """
     fronts: list[list[_Division]] = [[_Division(0, ())]]  # item n: the divisions of the first n registers
     for end in range(1, len(neighbours.registers) + 1):
-        fewest: dict[int, _Division] = {}  # by number of requests
+        fewest: dict[int, _Division] = {}  # divisions with the fewest characters, by number of requests
         for begin, count in neighbours.ending_at(end):
             own = characters(framing, neighbours.carrier, count)
             for before in fronts[begin]:

@@ -23,7 +23,7 @@ from multidrop.planning.blocks import Planned, planned, sending
 from multidrop.planning.bus_time import gap, in_order, kind, silence, switches
 from multidrop.planning.schedule import TURN_SHARE, Job, Schedule
 
-LATENESS = 100e-6  # s that a typical computer adds to each exchange, to wake up and to write
+LATENESS = 100e-6  # seconds that a typical computer adds to each exchange, to wake up and to write
 ENOUGH = 0.97  # a rate counts as reached from this fraction of the wanted rate on
 LEAST_EXCHANGES = 1000  # least number of simulated exchanges
 LEAST_ROUNDS = 3  # least number of simulated exchanges per job
@@ -49,7 +49,7 @@ class Rate:
 class Prediction:
     """The predicted bus cycle, utilisation and rates of one line."""
 
-    cycle: float  # s in which each request of the line is sent once
+    cycle: float  # duration in s of a bus cycle, in which each request of the line is sent once
     switches: int  # number of changes of baud rate or format in a bus cycle
     utilisation: float  # fraction of the line's time that the rates need; above 1, they cannot all be reached
     rates: tuple[Rate, ...]
@@ -73,7 +73,7 @@ class _Done(NamedTuple):
     skipped: int = 0
     first_ns: int = 0
     last_ns: int = 0
-    taken: float = 0.0  # s of bus time, including the silence before each exchange
+    taken: float = 0.0  # seconds of bus time, including the silence before each exchange
 
 
 NOT_RUN = _Done()
@@ -84,7 +84,7 @@ class _PredictedJob:
     """A job, and the results of its simulated exchanges."""
 
     planned: Planned
-    own: float  # s from the start of the request to the end of the reply, without silence
+    own: float  # seconds from the start of the request to the end of the reply, without silence
     done: _Done = NOT_RUN
 
     @property

@@ -158,11 +158,11 @@ class PlantLine:
     baudrate: int | None = None
     format: str | None = None
     drives: Sequence[PolledDrive] = ()  # converted to a tuple
-    switching: float = 0.0  # s that the port takes to change baud rate or format
+    switching: float = 0.0  # seconds that the port takes to change baud rate or format
     echo: Echo = Echo.AUTO
     ids: TransactionIds = TransactionIds.MATCH
     rs485: RS485 = RS485.OFF
-    settle: float = 0.0  # s of silence after the port is opened
+    settle: float = 0.0  # seconds of silence after the port is opened
 
     def __post_init__(self) -> None:
         if self.baudrate is not None and not is_whole(self.baudrate):
@@ -454,7 +454,7 @@ def with_triggers(plant: Plant, conditions: Collection[str]) -> TriggerChannels:
     texts: dict[TriggerSeries, str] = {}
     numbers: dict[TriggerSeries, int] = {}
     signals: dict[str, Sequence[TriggerSeries]] = {}
-    mistakes: dict[str, str] = {}  # by condition
+    mistakes: dict[str, str] = {}  # error sentences by condition
     names = [polled.drive.name for polled in plant.drives]
     by_fault = _showing_faults(plant) if FAULT in conditions else []
     for number, condition in enumerate(conditions):

@@ -1,9 +1,9 @@
-"""Rows of samples and misses (missing values): as Arrow columns, tables by time, and `Row` objects.
+"""Rows of samples and missing values: as Arrow columns, tables by time, and `Row` objects.
 
 `batch.to_pandas()`, `batch.to_polars()` and `batch.wide()` make tables. Any library with the Arrow PyCapsule
 interface can read a batch directly: `pyarrow.record_batch(batch)`, `duckdb.sql("from batch")`. multidrop
 itself needs no such library. `pandas.DataFrame(batch)` does not use the interface and would read row by row,
-with times as plain integers, so it raises TypeError. For NumPy, with NaN for every miss:
+with times as plain integers, so it raises TypeError. For NumPy, with NaN for every missing value:
 `nanoarrow.Array(batch).child(5).to_pysequence(handle_nulls=nanoarrow.nulls_as_sentinel())`.
 """
 
@@ -30,7 +30,7 @@ class ArrowTable(ABC):
     def __arrow_c_stream__(self, requested_schema: object = None) -> Any: ...
 
     def to_pandas(self) -> Any:
-        """Return a pandas.DataFrame; its `time` is datetime64[ns, UTC], and a miss is NaN.
+        """Return a pandas.DataFrame; its `time` is datetime64[ns, UTC], and a missing value is NaN.
 
         Raises ImportError if pandas or pyarrow is not installed.
         """
@@ -38,7 +38,7 @@ class ArrowTable(ABC):
         return _library("pyarrow", "pandas", "to_pandas").table(self).to_pandas()
 
     def to_polars(self) -> Any:
-        """Return a polars.DataFrame; its `time` is Datetime("ns", "UTC"), and a miss is null.
+        """Return a polars.DataFrame; its `time` is Datetime("ns", "UTC"), and a missing value is null.
 
         Raises ImportError if polars is not installed.
         """
@@ -97,8 +97,8 @@ class WideRows(ArrowTable):
     Rows of the long form (one row for each value) that have the same time to the nanosecond become one row.
     These are the rows of one request, because the registers of a request share the time at which it was sent.
     Other values are not joined, filled or interpolated: a row has values for the registers of one request,
-    and null for all others. A miss is also null; only the long form has its reason. Rows are sorted by
-    `monotonic_ns`, but the rows that follow a restart of the computer stay behind the rows before it.
+    and null for all others. A missing value is null too; only the long form has its reason. Rows are sorted
+    by `monotonic_ns`, but the rows that follow a restart of the computer stay behind the rows before it.
     """
 
     def __init__(self, rows: Iterable[Row], chosen: Sequence[str] = (), known: Collection[str] = ()) -> None:
@@ -112,7 +112,9 @@ class WideRows(ArrowTable):
                 raise TypeError(f"wide takes names of columns as separate arguments, not {name!r}")
         self._columns = {name: _WideColumn() for name in chosen}
         self._times: dict[tuple[int, int], int] = {}  # row numbers by (time, monotonic_ns)
-        self._starts = array("q")  # by row number: the number of restarts of the computer before the row
+        self._starts = array(
+            "q"
+        )  # for each row number: the number of restarts of the computer before the row
         restarts, newest = 0, (0, 0)  # `newest`: time and monotonic time of the newest row since the restart
         found: dict[tuple[str, str], _WideColumn | None] = {}
         owners: dict[str, tuple[str, str]] = {}
@@ -224,7 +226,7 @@ EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 class Row(NamedTuple):
-    """A sample, or a miss: a row without a value, whose status is the reason."""
+    """A value of a register, or a missing value; then the status is the reason."""
 
     time_ns: int  # UTC at which the request was sent
     monotonic_ns: int
@@ -309,8 +311,8 @@ class Rows(ArrowTable):
     def wide(self, *columns: str) -> WideRows:
         """Return a table with a row for each time and a column for each `drive.register`, or only `columns`.
 
-        The registers of one request share a row, and a miss is null: see `WideRows`. Raises ValueError for
-        an unknown column.
+        The registers of one request share a row, and a missing value is null: see `WideRows`. Raises
+        ValueError for an unknown column.
         """
         return WideRows(self, columns, self._may_have() if columns else ())
 

@@ -230,7 +230,7 @@ class _Session:
         if self._plan.limits.silence is None and all(map(_is_simulated, poller.buses.values())):
             silence = max(silence, SIMULATED_SILENCE_S)
         self._watch = LimitWatch(self._plan, round(silence * 1e9), clock.now_ns())
-        # ns that the computer had slept before the run
+        # time in ns for which the computer had slept before the run
         self._slept_ns = clock.boottime_ns() - clock.now_ns()
         self._looked_ns = clock.boottime_ns()  # when rows were last compared with the limits
         self._is_stopping = False
