@@ -39,7 +39,7 @@ except ImportError as missing:
 
 # limit, in s, of the first timeout on a port without transaction ids; a late reply lengthens it
 MOST_WAIT = 1.0
-LOSS_CHECK = 1.0  # s between checks whether an idle connection is lost
+LOSS_CHECK = 1.0  # seconds between checks whether an idle connection is lost
 OTHER = "use the ModbusConnection of modbus_connection.pymodbus"
 COUNTERS = (2, *range(0x0B, 0x13))  # sub-functions of function 08 that only read; 4 would silence a device
 # The command-line helper of `modbus-connection` reads this name.

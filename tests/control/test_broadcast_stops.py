@@ -63,7 +63,7 @@ def test_all_families_but_the_erman_have_broadcasts() -> None:
 
 
 @every_broadcasting
-def test_stop_all_does_not_broadcast_if_families_differ(model: str) -> None:
+def test_no_stop_is_broadcast_if_families_differ(model: str) -> None:
     """One family's stop may start a motor of the other family. Both orders of the drives are tested."""
     models = deque(MAKE)
     models.rotate(-models.index(model))
@@ -81,7 +81,7 @@ def check_stopped_without_broadcast(*models: str) -> None:
 
 
 @every_broadcasting
-def test_stop_all_broadcasts_if_all_drives_are_of_one_family(model: str) -> None:
+def test_a_stop_is_broadcast_if_all_drives_are_of_one_family(model: str) -> None:
     line, drives, _ = line_of(model, model)
     line.bus.stop_all()
     (sent,) = broadcasts(line)
@@ -89,12 +89,12 @@ def test_stop_all_broadcasts_if_all_drives_are_of_one_family(model: str) -> None
     assert (sent.start, sent.data) == (line.frames[-2][0].start, line.frames[-2][0].data)
 
 
-def test_stop_all_sends_no_broadcast_if_the_family_defines_no_broadcast() -> None:
+def test_no_stop_is_broadcast_if_the_family_defines_no_broadcast() -> None:
     check_stopped_without_broadcast("erman-er-g-220", "erman-er-g-220")
 
 
 @pytest.mark.parametrize("models", [("erman-er-g-220", "erman-er-g-220"), ("invt-che", "yd1000")])
-def test_stop_all_reports_failed_if_neither_broadcast_nor_stop_was_sent(models: tuple[str, str]) -> None:
+def test_a_stop_has_failed_if_neither_it_nor_a_broadcast_was_sent(models: tuple[str, str]) -> None:
     line, _, _ = line_of(*models)
 
     line.fails = lambda request: PortLost("hall", "there is no such port")
@@ -368,7 +368,7 @@ def test_a_broadcast_is_followed_by_the_turnaround_delay(monkeypatch: pytest.Mon
     assert driver.now == over + 100 * MS
 
 
-def test_stop_all_broadcasts_a_stop_and_then_checks_each_drive() -> None:
+def test_each_drive_is_checked_after_a_broadcast_stop() -> None:
     line, _, sims = che_drives(3, runs_s=1)
     begun = len(line.frames)
     stopped = line.bus.stop_all()
@@ -390,7 +390,7 @@ def test_each_drive_is_stopped_if_the_broadcast_fails() -> None:
     assert all_stopped(line, sims)
 
 
-def test_stop_all_reports_each_drive() -> None:
+def test_the_result_of_stop_all_has_each_drive() -> None:
     sims: list[Any] = [
         simulated(InvtCHE(1, maximum_frequency=50)),
         simulated(ErmanERG220(2)),

@@ -320,7 +320,7 @@ def test_a_repeated_stop_is_in_progress_from_its_call_to_its_end() -> None:
     run_controlled(live())
 
 
-def test_divided_separates_the_drives_whose_stop_is_already_repeated() -> None:
+def test_drives_whose_stop_is_already_repeated_are_separated() -> None:
     async def live() -> None:
         stops = RepeatedStops(stop_noted, on_threads)
         drives: list[Any] = [NotedStops(), NotedStops(), NotedStops()]

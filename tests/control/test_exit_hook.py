@@ -27,7 +27,7 @@ BOTH = pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 
 
 class Act:
-    """One action at exit, with its two callbacks. `work` returns when the test sets `go_on`."""
+    """The two callbacks of an exit task. `work` returns when the test sets `go_on`."""
 
     def __init__(self) -> None:
         self.is_begun = False
@@ -180,7 +180,7 @@ def exit_threads() -> set[threading.Thread]:
     return {thread for thread in threading.enumerate() if thread.name == "multidrop exit"}
 
 
-def test_a_failing_action_at_exit_is_logged(caught: list[int], caplog: pytest.LogCaptureFixture) -> None:
+def test_a_failing_exit_task_is_logged(caught: list[int], caplog: pytest.LogCaptureFixture) -> None:
     def fail() -> None:
         raise ZeroDivisionError
 
@@ -190,7 +190,7 @@ def test_a_failing_action_at_exit_is_logged(caught: list[int], caplog: pytest.Lo
     assert "the drives could not be stopped" in caplog.text
 
 
-def test_an_action_at_exit_may_be_finished_on_any_thread(caught: list[int]) -> None:
+def test_an_exit_task_may_be_finished_on_any_thread(caught: list[int]) -> None:
     hook, act = ExitHook(), Act()
     made = hook.add(act.begin, act.work)
     act.go_on.set()
@@ -223,7 +223,7 @@ def test_buses_opened_during_a_close_get_signals(caught: list[int], monkeypatch:
     until(lambda: caught == [signal.SIGTERM])
 
 
-def test_adding_an_action_at_exit_raises_if_no_signal_handler_can_be_installed(
+def test_an_exit_task_is_refused_if_no_signal_handler_can_be_installed(
     caught: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hook, acts = ExitHook(), [Act(), Act()]
@@ -349,7 +349,7 @@ def test_a_bus_made_on_a_thread_warns_if_the_program_replaced_a_signal_handler(
     assert acts[0].is_over
 
 
-def test_a_forked_child_has_its_own_actions_at_exit(caught: list[int]) -> None:
+def test_a_forked_child_has_its_own_exit_tasks(caught: list[int]) -> None:
     hook, acts = ExitHook(), [Act(), Act()]
     hook.add(acts[0].begin, acts[0].work)
     signal.raise_signal(signal.SIGTERM)

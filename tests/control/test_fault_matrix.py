@@ -204,7 +204,9 @@ def test_each_verb_has_its_outcome_during_each_fault(part: int, cell: tuple[str,
         if fault == "exception" and family == NO_EXCEPTIONS:
             return
         with pytest.MonkeyPatch.context() as monkeypatch:
-            monkeypatch.setattr(records, "LEAST_INTERVAL", 0.0)  # s between two EEPROM writes of one register
+            monkeypatch.setattr(
+                records, "LEAST_INTERVAL", 0.0
+            )  # seconds between EEPROM writes of one register
             tried = Cell(family, situation)
             tried.strike(fault)
             outcome = tried.outcome(verb)

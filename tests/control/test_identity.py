@@ -95,7 +95,7 @@ def test_no_write_is_sent_after_the_drive_was_replaced(monkeypatch: pytest.Monke
 @pytest.mark.slow
 @pytest.mark.parametrize("model", MAKE)
 def test_a_silent_drive_is_identified_before_a_write(model: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(records, "LEAST_INTERVAL", 0.0)  # s between two EEPROM writes of one register
+    monkeypatch.setattr(records, "LEAST_INTERVAL", 0.0)  # seconds between EEPROM writes of one register
     with known(model) as (bus, drive, received):
         looks: list[str] = []
         monkeypatch.setattr(type(drive).identify, "_script", lambda drive: iter(looks.append("look") or ()))
@@ -222,7 +222,7 @@ def test_a_setpoint_is_kept_if_one_reply_was_lost(model: str) -> None:
 
 
 @pytest.mark.slow
-def test_missed_polls_count_as_silence() -> None:
+def test_polls_without_a_reply_count_as_silence() -> None:
     """Missed polls alone, without calls, make the drive's identity uncertain."""
     sim = simulated(MAKE["invt-che"](1))
     assert isinstance(sim, MotorDrive)
@@ -416,7 +416,7 @@ def test_a_stop_is_sent_unless_two_replies_show_the_same_family(codes: tuple[int
     assert STOPS["invt-che"](writes(line)[0])
 
 
-def test_a_stop_is_never_refused_after_a_missed_reply() -> None:
+def test_a_stop_is_never_refused_after_a_missing_reply() -> None:
     """The drive's next reply may belong to an earlier request."""
     line, drive, sim = one(InvtCHE(1))
     sim["device"] = 0x010A
@@ -447,7 +447,7 @@ OTHERS: Sequence[tuple[Drive, Drive]] = (  # (declared drive, drive on the line)
 
 
 @table("pair", OTHERS)
-def test_the_error_of_a_withheld_stop_names_the_other_familys_command(pair: tuple[Drive, Drive]) -> None:
+def test_the_error_of_a_withheld_stop_has_the_other_familys_command(pair: tuple[Drive, Drive]) -> None:
     declared, there = pair
     sim = simulated(there)
     line = SimulatedBus(sim)

@@ -42,7 +42,7 @@ def pair() -> Iterator[RunningPair]:
     made.bus.close()
 
 
-def test_stops_on_exit_says_whether_stop_on_exit_was_called(pair: RunningPair) -> None:
+def test_a_bus_shows_whether_stop_on_exit_was_called(pair: RunningPair) -> None:
     assert pair.bus.stops_on_exit is False
     pair.bus.stop_on_exit()
     assert pair.bus.stops_on_exit is True
@@ -61,7 +61,9 @@ def test_no_stop_is_sent_by_default_when_the_bus_is_left(pair: RunningPair) -> N
     assert pair.line.frames == []
 
 
-def test_stop_on_exit_stops_detached_drives(pair: RunningPair, caplog: pytest.LogCaptureFixture) -> None:
+def test_detached_drives_are_stopped_if_stop_on_exit_was_called(
+    pair: RunningPair, caplog: pytest.LogCaptureFixture
+) -> None:
     first, second = pair.drives
     begun = [drive.begin_call("start", drive.stops_called[0]) for drive in pair.drives]
     pair.bus.part_with([first], [first])

@@ -179,7 +179,9 @@ def test_nothing_is_sent_once_the_right_to_send_has_expired(scene: Scene) -> Non
         assert scene.requests <= sent
 
 
-def test_an_unsent_stops_error_says_the_motor_runs_on(scene: Scene, caplog: pytest.LogCaptureFixture) -> None:
+def test_the_error_of_an_unsent_stop_says_that_the_motor_runs_on(
+    scene: Scene, caplog: pytest.LogCaptureFixture
+) -> None:
     port = scene.bus.line.port
     sentence = (
         "pump: the stop was NOT sent, and the motor continues as it is: this process is not the master of "
@@ -195,7 +197,7 @@ def test_an_unsent_stops_error_says_the_motor_runs_on(scene: Scene, caplog: pyte
     ]
 
 
-def test_stop_all_reports_each_unsent_stop(scene: Scene) -> None:
+def test_each_unsent_stop_is_reported_by_stop_all(scene: Scene) -> None:
     other = scene.bus.attach(Brief(2, name="fan"))
     found = scene.bus.stop_all()
     assert {name: stopped.seen for name, stopped in found.items()} == {

@@ -164,7 +164,7 @@ def test_a_ramp_is_refused_without_the_option_confirmed() -> None:
 
 
 @pytest.mark.parametrize("gap", [0, 0.5])
-def test_staggered_starts_keep_the_gap_between_them_which_may_be_zero(gap: float) -> None:
+def test_staggered_starts_keep_the_given_gap(gap: float) -> None:
     line, drives, sims = che_drives(2)
     begun = line.seconds
     start_staggered(drives, gap)

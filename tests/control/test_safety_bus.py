@@ -126,7 +126,7 @@ def test_a_raw_request_bypasses_all_rules_and_errors_name_it_as_raw() -> None:
 
 @every_family
 def test_only_the_first_write_follows_an_identity_check(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
-    monkeypatch.setattr(records, "LEAST_INTERVAL", 0.0)  # s between writes of one register to an EEPROM
+    monkeypatch.setattr(records, "LEAST_INTERVAL", 0.0)  # seconds between writes of one register to an EEPROM
     line, drive, _ = one(MAKE[model](1))
     drive.set_frequency(20)
     assert line.frames[0][1] not in line.written
@@ -157,7 +157,7 @@ def test_an_unidentified_innovert_ibd_is_written_only_if_confirmed() -> None:
             assert line.written == []
 
 
-def test_try_write_returns_how_each_write_ended() -> None:
+def test_the_outcome_of_each_write_is_returned_by_try_write() -> None:
     line, drive, _ = one(InnovertIBD(1))
     outcome = drive.try_write(drive.acceleration_time, 20.0)
     assert (outcome.effect, outcome.held) == (Effect.DONE, 20.0)

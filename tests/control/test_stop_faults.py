@@ -175,7 +175,7 @@ def test_all_started_drives_are_stopped_although_a_stop_is_interrupted(
         assert not any(sim.motor.goal for sim in sims), nth
 
 
-def test_a_failed_staggered_start_stops_all_even_if_one_stop_raises(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_started_drives_are_stopped_even_if_one_stop_raises(monkeypatch: pytest.MonkeyPatch) -> None:
     class NoThread(threading.Thread):
         def start(self) -> None:
             raise MemoryError
@@ -316,7 +316,9 @@ def test_a_repeated_stop_opens_a_locked_eeprom_ledger_only_once(
     assert sum(wear.writes for wear in ledger.wear(1.8e9)) == len(line.written) - before > 40
 
 
-def test_stop_is_sent_if_the_port_name_is_not_text(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_stop_is_sent_even_if_the_port_name_is_not_text(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     line = SimulatedBus(simulated(Fan(1)), ledger=tmp_path / "wear")
     line.identity = "/dev/tty\udcff"
     line.attach(Fan(1)).stop()

@@ -132,7 +132,7 @@ def test_a_stop_cancels_a_ramp_in_progress() -> None:
     assert after == []
 
 
-def test_stop_all_cancels_a_staggered_start(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_of_all_drives_cancels_a_staggered_start(monkeypatch: pytest.MonkeyPatch) -> None:
     """A stop between two starts prevents the second start."""
     line, drives, sims = che_drives(2)
     perform = drives[1].perform
@@ -261,7 +261,7 @@ class Patient(Own):
         yield from read(self.speed)
 
 
-def test_a_stop_script_s_waits_are_cut_off_at_the_stop_s_time_limit() -> None:
+def test_the_waits_of_a_stop_script_end_at_the_time_limit_of_the_stop() -> None:
     line = SimulatedBus(simulated(Patient(1)))
     drive = line.attach(Patient(1))
     begun = line.seconds
@@ -271,7 +271,7 @@ def test_a_stop_script_s_waits_are_cut_off_at_the_stop_s_time_limit() -> None:
     assert len(line.written) == 1
 
 
-def test_stop_all_repeats_its_stops_for_the_given_seconds_only() -> None:
+def test_a_stop_of_all_drives_is_repeated_for_the_given_time_only() -> None:
     sims: list[Any] = [simulated(InvtCHE(1, maximum_frequency=50)), simulated(ErmanERG220(2))]
     line = SimulatedBus(*sims)
     for sim in sims:
@@ -551,7 +551,7 @@ def test_a_write_cancelled_by_a_stop_is_not_counted(tmp_path: Path) -> None:
     assert frames > 2
 
 
-def test_stop_all_stops_other_drives_if_a_script_raises() -> None:
+def test_other_drives_are_stopped_if_a_stop_script_raises() -> None:
     class Broken(Own):
         """A drive whose stop fails before it sends anything."""
 

@@ -22,7 +22,7 @@ from multidrop.transport.exchange import Exchanges
 STOPPED = "a stop was called"
 REMOVED = "the drive was taken off the bus"
 LEFT = "the bus was left"
-POLL_S = 0.005  # s between checks whether all stops have ended
+POLL_S = 0.005  # seconds between checks whether all stops have ended
 
 
 class Latches:

@@ -41,7 +41,7 @@ JOIN_S = 0.5  # s; stops above that limit are joined for this long, and then sen
 BEGINNING_S = 0.25  # s; longest time from the call of a stop until `stops_under_way` lists it
 
 R = TypeVar("R")
-Results = dict[str, CommandResult]  # by drive name
+Results = dict[str, CommandResult]  # results by drive name
 StopFuture = asyncio.Future[Results]
 StopWork = Callable[[float | None], Results]  # argument: for how many s to repeat the stop (None: default)
 

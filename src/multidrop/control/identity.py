@@ -111,7 +111,7 @@ class _Findings:
 
 
 class IdentityCheck:
-    """Checks drives against their declared family, and remembers the results until the port is reopened."""
+    """Checks drives against their declared family, and keeps the results until the port is reopened."""
 
     def __init__(self, exchanges: Exchanges, echo: EchoCheck) -> None:
         self._exchanges = exchanges

@@ -44,7 +44,7 @@ BUDGET = CYCLES // YEARS  # limit of writes of one register in a year
 NO_HOME = Path("/nonexistent")  # replaces the home folder of a user who has none
 LATEST = 6e10  # s; the file is damaged if a time in it is further than this from 1970
 YEARLY = "times in a year"  # only the error for a used-up yearly budget contains these words
-LEAST_INTERVAL = 60.0  # s between two writes of a register that is kept in EEPROM
+LEAST_INTERVAL = 60.0  # seconds between two writes of a register that is kept in EEPROM
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ METADATA = {"plant": "завод.toml", "drives": {"pump-1": {"registers": {"spe
 
 
 def batch(names: Names, drive: int, numbers: Iterable[int], begin: int, step: int) -> Batch:
-    """Return a batch with a row per number, in the core's memory as after a poll; every tenth row is a miss.
+    """Return a batch with a row per number, in the core's memory as after a poll. Every tenth has no value.
 
     A row's request was sent at `number * step` ns of the monotonic clock, which is UTC minus `begin`.
     """
@@ -51,7 +51,7 @@ _SPEED = Names(["speed"])
 
 
 def random_rows(seed: int, begin: int, count: int, step: int = SECOND // 5) -> list[Row]:
-    """Return rows of six series at irregular times; about one in seven is a miss."""
+    """Return rows of six series at irregular times; about one value in seven is missing."""
     dice = random.Random(seed)
     rows, time = [], begin
     for _ in range(count):

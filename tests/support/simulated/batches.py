@@ -80,7 +80,7 @@ EXAMPLE = [
 
 
 def counting(rows: int, start: int = 0) -> Batch:
-    """Return a batch whose values count up from `start` (below 65536); every tenth row is a miss."""
+    """Return a batch whose values count up from `start` (below 65536); every tenth value is missing."""
     columns = Columns(rows)
     for at in range(start, start + rows):
         drive = block(at % 3, at % 2, divisor=1.0)

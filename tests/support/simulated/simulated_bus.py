@@ -197,7 +197,7 @@ def one(drive: Drive, **details: Any) -> tuple[SimulatedBus, Any, MotorDrive]:
 # ---- starts and stops ----
 
 
-STOPS: dict[str, Callable[[Message], bool]] = {  # by family: whether a request is its documented stop
+STOPS: dict[str, Callable[[Message], bool]] = {  # by family: returns True for its documented stop
     "erman-er-g-220": lambda each: each.function == 5 and each.start == 1 and each.data != b"\0\0",
     "invt-che": lambda each: each.start == 0x1000 and each.data[-1] == 5,
     "innovert-ibd": lambda each: each.start == 0x2000 and each.data[-1] == 1,
