@@ -1,4 +1,4 @@
-"""Drills with real processes that are killed or suspended: no line ever has two masters.
+"""Drills: gateways and servers are killed, suspended and cut off, and no line ever has two masters.
 
 The simulated drives record all requests, and count overlaps of two masters on a line. `python -m
 bench.questions.fleet.drills --rounds 40` runs more drills.
@@ -10,9 +10,21 @@ import signal
 import subprocess
 from collections.abc import Iterator
 from functools import partial
+from typing import Any
 
 import pytest
-from fleet_drills import DEEDS, PATIENCE_S, SOON_S, FleetDrill, drilled, judged_at_end
+from fleet_drills import (
+    DEEDS,
+    PATIENCE_S,
+    SOON_S,
+    FleetDrill,
+    MachineDrill,
+    cut,
+    drilled,
+    drilled_in_network,
+    drilled_on_machines,
+    judged_at_end,
+)
 
 pytestmark = [pytest.mark.slow, pytest.mark.long]
 
@@ -24,6 +36,7 @@ DONE = (
     "ownership leader killed",
     "all nodes killed",
 )
+CUT = ("gateway cut off", "gateway does not hear the nodes", "node hears nobody")
 
 
 @pytest.fixture(scope="module")
@@ -62,3 +75,73 @@ def test_no_line_has_two_masters_while_gateways_or_servers_fail(drill: FleetDril
     drill.settle()
     drill.judge(lambda: DEEDS[deed](drill), SOON_S)
     assert drill.hall.overlaps() == 0
+
+
+# ---- in network namespaces: cables are cut, and whole machines die ----
+
+
+@pytest.fixture(scope="module")
+def cut_drill(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FleetDrill]:
+    with judged_at_end(drilled_in_network(tmp_path_factory.mktemp("cuts"))) as found:
+        yield found
+
+
+@pytest.mark.parametrize("name", CUT)
+def test_no_line_has_two_masters_while_cables_are_cut(cut_drill: FleetDrill, name: str) -> None:
+    cut_drill.settle()
+    cut_drill.judge(lambda: cut(cut_drill, name), SOON_S)
+    assert cut_drill.hall.overlaps() == 0
+
+
+def test_a_gateway_that_is_cut_off_from_its_lines_hands_them_over(cut_drill: FleetDrill) -> None:
+    cut_drill.settle()
+    place, host = cut_drill.places["gw-a"], cut_drill.hall.host
+
+    def gateway() -> dict[str, Any]:
+        found: dict[str, Any] = cut_drill.status()["gateways"]["gw-a"]
+        return found
+
+    session = gateway()["session"]
+    cut_drill.hall.reset()
+    place.cut_to_here(host)
+    try:
+        # `cut_drill.status` also checks that `fleet status` exits with 1 while a port is lost
+        cut_drill.wait(lambda: gateway()["says"]["lost"] != [], "status tells of lost ports")
+        cut_drill.wait(lambda: cut_drill.hall.are_polled(1.0) and not gateway()["lines"], "handed over")
+        found = cut_drill.run("status")
+        assert "cannot be opened from here; another gateway polls it" in found.stdout
+        assert found.returncode == 0
+        assert gateway()["session"] == session
+    finally:
+        place.heal_to_here(host)
+        # a restarted gateway has reported no line, so it tries to open all its lines immediately
+        cut_drill.gateways["gw-a"].kill()
+        cut_drill.gateways["gw-a"].wait()
+    assert cut_drill.hall.overlaps() == 0
+
+
+@pytest.fixture(scope="module")
+def machine_drill(tmp_path_factory: pytest.TempPathFactory) -> Iterator[MachineDrill]:
+    with judged_at_end(drilled_on_machines(tmp_path_factory.mktemp("machines"))) as found:
+        yield found
+
+
+def test_the_lines_of_a_dead_machine_get_new_masters_without_an_election(
+    machine_drill: MachineDrill,
+) -> None:
+    """The drill has waited until other machines lead the ownership buckets of the dead gateway's lines."""
+    machine_drill.settle()
+    before = machine_drill.status()["lines"]
+    machine_drill.judge(machine_drill.kill_machine, SOON_S)
+    assert machine_drill.hall.overlaps() == 0
+
+    def has_moved() -> bool:
+        return any(one != before[line] for line, one in machine_drill.status()["lines"].items())
+
+    machine_drill.wait(has_moved, "lines of the dead machine have moved")
+
+
+def test_no_line_has_two_masters_while_whole_machines_are_cut_off(machine_drill: MachineDrill) -> None:
+    machine_drill.settle()
+    machine_drill.judge(machine_drill.cut_machine, SOON_S)
+    assert machine_drill.hall.overlaps() == 0

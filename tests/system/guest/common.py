@@ -76,8 +76,10 @@ def until_answered(call: Callable[..., object], *arguments: Any) -> Any:
 
 
 def insist(call: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
-    """Repeat a call until it succeeds, and return its result. On a busy computer a write may expire, and a
-    reply may come too late. Raises the last error after ATTEMPTS failures.
+    """Repeat a call until it succeeds, and return its result.
+
+    On a busy computer, a write may expire, and a reply may come too late. Raises the last error after
+    ATTEMPTS failures.
     """
     for _ in range(ATTEMPTS - 1):
         result = attempt(call, *arguments, **options)
@@ -192,8 +194,9 @@ class Poll:
     def wait_for(
         self, status: str, lines: Iterable[str], after: int = 0, patience: float = plug.PATIENCE_S
     ) -> int:
-        """Wait until each line has a row with this status, not counting the first `after` rows. Return the
-        number of rows.
+        """Wait until each line has a row with this status, not counting the first `after` rows.
+
+        Return the number of rows.
         """
         wanted = set(lines)
 
