@@ -73,7 +73,7 @@ def test_an_unreachable_server_is_reported_in_one_sentence(run: Run, nobody: str
 
 
 @pytest.mark.parametrize("words", [["stop", "pump-1"], ["write", "pump-1", "frequency", "20", "--yes"]])
-def test_without_a_home_folder_a_stop_is_still_sent(
+def test_a_stop_is_sent_for_a_user_without_a_home_folder(
     run: Run, nobody: str, monkeypatch: pytest.MonkeyPatch, words: list[str]
 ) -> None:
     """A container's user may have no home folder, and so no log. Other commands are then not sent."""
@@ -299,7 +299,9 @@ def test_a_nats_server_version_is_parsed(tmp_path: Path, said: str, version: tup
     assert demo.version_of(str(program)) == version
 
 
-def test_without_nats_server_the_error_says_where_it_is(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_error_about_a_missing_nats_server_says_where_to_get_it(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(demo, "_programs", lambda: iter(["/nowhere/nats-server"]))
     status, out, err = run("fleet", "demo")
     assert (status, out) == (2, "")

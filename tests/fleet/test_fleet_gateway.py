@@ -180,7 +180,7 @@ async def test_the_gateway_closes_its_other_parts_after_one_part_fails_to_close(
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_without_servers_a_gateway_shuts_down_in_order(tmp_path: Path) -> None:
+def test_a_gateway_shuts_down_in_order_without_servers(tmp_path: Path) -> None:
     words = [sys.executable, "-m", "multidrop", "fleet"]
     with cluster(tmp_path / "nats", 1) as one, closing(SerialHall(1)) as hall:
         environment = {**os.environ, "MULTIDROP_NATS": one.urls[0], "XDG_STATE_HOME": str(tmp_path)}

@@ -252,7 +252,7 @@ async def test_watch_ends_when_the_task_of_its_connection_ends(monkeypatch: pyte
         await views.follow(watch, lambda told: None, asyncio.Event())
 
 
-def test_without_a_terminal_watch_suggests_json(run: Run) -> None:
+def test_the_watch_command_suggests_json_without_a_terminal(run: Run) -> None:
     status, out, err = run("fleet", "watch")
     assert (status, out) == (2, "")
     assert "`multidrop fleet watch` needs a terminal; with --json it works without one" in err
@@ -277,7 +277,7 @@ def test_watch_prints_one_line_a_second_until_interrupted(fleet: Cluster) -> Non
 
 
 @pytest.mark.long
-def test_on_a_terminal_watch_draws_until_interrupted(fleet: Cluster) -> None:
+def test_the_watch_command_draws_on_a_terminal_until_interrupted(fleet: Cluster) -> None:
     with on_terminal("fleet", "watch", MULTIDROP_NATS=",".join(fleet.urls)) as terminal:
         terminal.wait_for("0 lines, 0 without a master")
         terminal.process.send_signal(signal.SIGINT)

@@ -473,7 +473,7 @@ def test_a_gateway_whose_session_another_gateway_ended_is_listed_as_missing() ->
     assert found["gateways"]["gw-4"]["session"] == 3
 
 
-def test_without_a_connection_the_error_names_the_servers() -> None:
+def test_an_error_without_a_connection_contains_the_urls_of_the_servers() -> None:
     made = view()
     made._path.is_open = False
     with pytest.raises(FleetError, match="no NATS server can be reached at nats://a:4222"):

@@ -66,7 +66,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
 
 
 @pytest.mark.slow
-def test_hub_once_stores_every_row_of_the_stream_once(
+def test_a_hub_with_the_option_once_stores_every_row_of_the_stream_once(
     running: Cluster, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     require_module("duckdb")

@@ -226,7 +226,7 @@ async def test_an_unconfirmed_command_is_cancelled_when_its_result_is_requested(
 
 
 @patient
-async def test_without_a_permission_list_only_stops_are_carried_out(tmp_path: Path) -> None:
+async def test_only_stops_are_carried_out_without_a_permission_list(tmp_path: Path) -> None:
     with desks(tmp_path, {}) as desk:
         for what in ({"register": SETPOINT, "value": 20.0}, {"verb": "start"}, {"verb": "emergency_stop"}):
             answer = desk.ask(**what)

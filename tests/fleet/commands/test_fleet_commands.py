@@ -382,7 +382,7 @@ def test_a_stop_is_sent_even_if_its_senders_name_is_invalid(tmp_path: Path, by: 
 
 
 @pytest.mark.parametrize("what", [write, lambda client: client.stop(["pump-1"])])
-def test_if_the_plant_cannot_be_read_no_command_or_stop_is_sent(tmp_path: Path, what: Any) -> None:
+def test_no_command_or_stop_is_sent_if_the_plant_cannot_be_read(tmp_path: Path, what: Any) -> None:
     with pytest.raises(FleetError, match="no server"):
         asked(tmp_path, ScriptedPath(), what, Plant(FleetError("no server")))
 

@@ -238,7 +238,7 @@ async def test_an_unanswered_renewal_does_not_extend_an_ended_session() -> None:
     assert trial.masterships[0].events == ["extend", "end"]
 
 
-async def test_a_late_answer_to_an_ended_session_does_not_count_for_the_next_session() -> None:
+async def test_a_late_answer_to_an_ended_session_does_not_extend_the_next_session() -> None:
     trial = Trial()
     late = GatedBucket("lease_2", answers=True)
     trial.buckets[2] = late
@@ -343,7 +343,7 @@ async def test_no_session_starts_if_only_one_lease_record_is_free() -> None:
     assert first.is_valid
 
 
-async def test_if_two_processes_start_the_same_session_at_most_one_is_valid() -> None:
+async def test_at_most_one_session_is_valid_if_two_processes_start_it() -> None:
     trial = Trial()
     first, second = trial.lease(), trial.lease()
     begun = await asyncio.gather(first.try_to_begin(), second.try_to_begin())

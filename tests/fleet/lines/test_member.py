@@ -376,7 +376,9 @@ async def test_sessions_without_a_third_lease_record_are_given_up_one_after_anot
 
 @pytest.mark.slow
 @pytest.mark.long
-async def test_without_servers_all_lines_are_closed(fleet: Cluster, caplog: pytest.LogCaptureFixture) -> None:
+async def test_all_lines_are_closed_if_no_server_answers(
+    fleet: Cluster, caplog: pytest.LogCaptureFixture
+) -> None:
     """The kernel's timer is cancelled when the lines are closed, and never set to a time in the past."""
     async with gateways(fleet, "a", "b") as running:
         await until(running.are_shared, "shares")  # until each gateway has had a lease and a timer
@@ -449,7 +451,7 @@ def test_a_gateway_whose_lease_record_has_no_rules_version_is_incompatible(trial
     assert trial.trouble == SENTENCE.format("first")
 
 
-def test_a_killed_incompatible_gateway_is_ignored_once_its_lease_has_expired(trial: Trial) -> None:
+def test_a_killed_incompatible_gateway_is_ignored_when_its_lease_has_expired(trial: Trial) -> None:
     trial.begin("older", RULES - 1)
     assert trial.trouble
     trial.clock.now += USUAL.lease - 1

@@ -78,7 +78,7 @@ def test_each_line_has_the_gateway_of_greatest_weight_that_has_room(lines: int, 
     assert assign(LINES[:lines], GATEWAYS[:number]) == wanted
 
 
-def test_without_gateways_no_line_is_assigned() -> None:
+def test_no_line_is_assigned_if_there_is_no_gateway() -> None:
     assert assign(LINES, []) == {}
 
 
@@ -134,7 +134,7 @@ def test_a_starting_fleet_assigns_lines_when_no_more_gateways_join() -> None:
     assert trial.is_shared_with("b", "c")
 
 
-def test_after_3_s_lines_are_assigned_again_whenever_a_gateway_joins_or_ends() -> None:
+def test_a_gateway_older_than_3_s_assigns_lines_again_when_a_gateway_joins_or_ends() -> None:
     trial = Trial()
     trial.clock.pass_s(SETTLE_S)
     assert trial.is_shared_with("b", "c")
@@ -159,7 +159,7 @@ def reported(*lines: str) -> tuple[HandClock, UnopenedLines]:
     return clock, unopened
 
 
-def test_a_line_is_reported_after_three_failed_openings() -> None:
+def test_a_line_is_reported_as_unopened_after_three_failures() -> None:
     unopened = UnopenedLines(HandClock())
     for _ in range(OPENINGS - 1):
         unopened.failed("a")
@@ -222,7 +222,7 @@ def test_unopened_lines_are_tried_one_after_another_with_increasing_pauses() -> 
         wait_s = min(2 * wait_s, LAST_WAIT_NS / SECOND)
 
 
-def test_lines_reported_by_all_gateways_are_tried_first_and_regularly() -> None:
+def test_lines_that_no_gateway_can_open_are_tried_first_and_regularly() -> None:
     clock, unopened = reported(*"abc")
     unopened.hopeless = frozenset("b")
     for _ in range(5):
@@ -272,7 +272,7 @@ SHARED = assign(SIXTY, ["a", "b", "c"])
 OF_A = {line for line, name in SHARED.items() if name == "a"}
 
 
-def test_only_reported_lines_move_and_each_gateway_computes_the_same_moves() -> None:
+def test_only_unopened_lines_move_and_all_gateways_compute_the_same_moves() -> None:
     found = hand_over(SHARED, {"a": OF_A, "b": [], "c": []})
     assert set(found.values()) == {"b", "c"}
     assert {line for line in SIXTY if found[line] != SHARED[line]} == OF_A
@@ -283,7 +283,7 @@ def test_a_line_that_no_gateway_can_open_is_not_moved() -> None:
     assert hand_over(SHARED, {"a": SIXTY, "b": SIXTY, "c": SIXTY}) == SHARED
 
 
-def test_a_reported_line_moves_to_a_gateway_that_has_not_reported_it() -> None:
+def test_an_unopened_line_moves_to_a_gateway_that_can_open_it() -> None:
     found = hand_over(SHARED, {"a": OF_A, "b": OF_A, "c": []})
     assert {found[line] for line in OF_A} == {"c"}
 

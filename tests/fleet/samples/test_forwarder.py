@@ -439,7 +439,7 @@ def settled(spool: Spool, most: int) -> SpoolState:
 
 
 @pytest.mark.long
-async def test_after_a_long_outage_each_row_is_stored_or_counted_as_lost(tmp_path: Path, most: int) -> None:
+async def test_each_row_is_stored_or_counted_as_lost_after_a_long_outage(tmp_path: Path, most: int) -> None:
     """The spool cannot hold all rows of the outage."""
     require_module("duckdb")
     with cluster(tmp_path / "nats", 1) as servers:

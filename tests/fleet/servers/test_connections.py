@@ -204,7 +204,7 @@ async def test_a_failed_read_raises_if_the_budget_for_repeats_is_empty() -> None
     assert asked(paths) == [[0.0], []]
 
 
-async def test_after_slow_answers_reads_are_repeated_later() -> None:
+async def test_reads_are_repeated_later_if_answers_were_slow() -> None:
     """Many gateways that start together slow down the servers; early repeats would slow them down more."""
     path, others, budget = LatePath(0.2), [SlowPath("b"), SlowPath("c")], full()
     for _ in range(10):
@@ -212,7 +212,7 @@ async def test_after_slow_answers_reads_are_repeated_later() -> None:
     assert asked(others) == [[0.1], [0.1]]  # only the first read was repeated
 
 
-async def test_after_fast_answers_lost_reads_are_repeated_soon() -> None:
+async def test_lost_reads_are_repeated_soon_if_answers_were_fast() -> None:
     paths, budget = [LatePath(0.3) for _ in range(3)], full()
     await questions(10, paths, budget)
     for path in paths:
@@ -334,7 +334,7 @@ async def test_a_server_that_stays_silent_is_ignored_until_it_returns(servers: S
     assert all(servers.terms[bucket] > before[bucket] for bucket in names.LEASES)
 
 
-async def test_after_a_failed_hand_over_no_other_bucket_is_handed_over(servers: Servers) -> None:
+async def test_no_other_bucket_is_handed_over_after_a_failed_hand_over(servers: Servers) -> None:
     servers.silent, servers.stuck = {"n3"}, set(names.LEASES)
     servers.leaders[names.LEASES[2]] = "n1"
     await servers.pass_s(1)
