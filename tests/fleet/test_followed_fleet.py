@@ -445,7 +445,7 @@ def test_an_invalid_list_of_moved_lines_in_an_answer_is_ignored(moves: Any) -> N
 def test_a_gateway_whose_session_another_gateway_ended_is_listed_as_missing() -> None:
     now_ms = time.time_ns() // 1_000_000
     made = view()
-    died = {  # by gateway: its newest record in each lease bucket, and whether the gateway counts as missing
+    died = {  # newest record in each lease bucket, and whether the gateway counts as missing, by gateway
         "gw-4": (lease(2, ended=True) | {"by": "gw-1", "at_ms": now_ms - 60_000}, True),
         # this gateway has ended its session itself
         "gw-5": (lease(2, ended=True) | {"at_ms": now_ms}, False),

@@ -99,7 +99,7 @@ class RowReader:
         self._statuses = NameCodes(MOST_STATUSES, OTHER, "ok")
         self._newest: dict[tuple[str, str], int] = {}  # time of the newest sample, by drive and register
         self._read_ns = 0  # this computer's clock (UTC, ns) at the last call of `rows`
-        # by gateway: arrival time of its newest sample, and the sample's own time (UTC, ns)
+        # arrival time of the newest sample, and the sample's own time (UTC, ns), by gateway
         self.arrivals: dict[str, tuple[int, int]] = {}
 
     def rows(self, messages: Sequence[StreamMessage]) -> FollowedRows | None:
@@ -192,11 +192,11 @@ class FollowedFleet:
         self._folder = TemporaryDirectory(prefix="multidrop-")
         self._records: Mapping[str, Record] = {}  # line records that the next call of `adopt` will use
         self._wanted: Mapping[str, int] = {}  # revisions of the line records at the last call of `on_change`
-        # by line: the record's revision, and the parsed line (None if the record has a mistake)
+        # revision of a line's record, and the parsed line (None if the record has a mistake), by line
         self._lines: dict[str, tuple[int, PlantLine | None]] = {}
-        self._line_of: dict[str, str] = {}  # by drive
+        self._line_of: dict[str, str] = {}  # line names by drive
         self._begun = time.monotonic()
-        self._heard: dict[str, float] = {}  # by line: when its newest sample arrived
+        self._heard: dict[str, float] = {}  # arrival time of the newest sample, by line
 
     # ---- reading ----
 

@@ -84,7 +84,7 @@ class FleetGateway:
         self.log.open()
         self.commands = CommandSubjects(name, self.paths, held, self.log)
         commanded = CommandedLines(self.lines, self.commands, lambda: self.member.lease.left_s > SILENT_S)
-        self.member = Member(*(name, self.paths, commanded, self.mastership), lock=self.lock)
+        self.member = Member(name, self.paths, commanded, self.mastership, lock=self.lock)
         self.forwarder: Forwarder | None = None
         self._end = asyncio.Event()
 

@@ -101,7 +101,7 @@ class FleetView:
 
     def _lines(self, sessions: Container[str]) -> dict[str, Any]:
         observer, plant = self._records.observer, self._records.plant.records
-        held: dict[tuple[str, int], bool] = {}  # by owner: True if its session is alive
+        held: dict[tuple[str, int], bool] = {}  # True if the owner's session is alive, by owner
         found: dict[str, Any] = {}
         for name in self._records.lines():
             record = self._records.owner(name)

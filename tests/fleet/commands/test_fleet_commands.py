@@ -113,7 +113,7 @@ NO_RIGHT = MayNotSend("no right")
 ANY = FleetError("no right")  # after this error, the gateway may or may not have received the request
 UNDER_WAY, TAKEN_BACK, IT_IS_DONE = answer("under way"), answer("not sent"), answer("done")
 
-# by case: server connection, expected outcome, number of sent confirmations
+# server connection, expected outcome and number of sent confirmations, by case
 WRITES: dict[str, tuple[ScriptedPath, CommandOutcome, int]] = {
     "done": (ScriptedPath(cmd=[OFFER], do=[IT_IS_DONE]), DONE, 1),
     "no master": (ScriptedPath(cmd=[NOBODY]), NOT_SENT, 0),

@@ -187,7 +187,7 @@ def test_the_first_records_of_lines_are_spread_over_all_three_buckets() -> None:
 # ---- a line is released only while other gateways can claim it, now and immediately afterwards ----
 
 
-# by bucket: a line whose first record is in this bucket
+# a line whose first record is in the bucket, by bucket
 FIRST = {names.owner_buckets(line)[0]: line for line in (f"line-{at}" for at in range(30))}
 FIRST_LINES = set(FIRST.values())
 

@@ -200,7 +200,7 @@ class Hall:
     def __init__(self) -> None:
         self.gateways: list[RecordingLines] = []
         self.overlaps: list[str] = []
-        self.at: dict[str, float] = {}  # line: time of its last claim, in s
+        self.at: dict[str, float] = {}  # time of the last claim (s), by line
 
     def add(self, name: str, mastership: RecordingMastership) -> RecordingLines:
         lines = RecordingLines(name, mastership, self)

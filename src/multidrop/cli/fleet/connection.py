@@ -16,8 +16,13 @@ from multidrop.cli.support.signals import run_loop
 from multidrop.control.records import default_ledger_path
 from multidrop.printable import masked
 
+if TYPE_CHECKING:
+    from multidrop.fleet.servers.connections import ServerPath
+
 URLS = "nats://127.0.0.1:4222"
 CREDENTIALS, CA = "MULTIDROP_NATS_CREDENTIALS", "MULTIDROP_NATS_CA"
+# the result of state_folder() if XDG_STATE_HOME is not set; for help texts
+STATE = "~/.local/state/multidrop/fleet"
 
 
 def add_nats_arguments(parser: argparse.ArgumentParser) -> None:
@@ -66,13 +71,6 @@ def _is_news(record: logging.LogRecord) -> bool:
 def _named(variable: str) -> Path | None:
     text = os.environ.get(variable)
     return Path(text) if text else None
-
-
-if TYPE_CHECKING:
-    from multidrop.fleet.servers.connections import ServerPath
-
-# the result of state_folder() if XDG_STATE_HOME is not set; for help texts
-STATE = "~/.local/state/multidrop/fleet"
 
 
 def add_server_arguments(parser: argparse.ArgumentParser) -> None:

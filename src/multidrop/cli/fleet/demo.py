@@ -34,7 +34,7 @@ GATEWAYS = ("gw-1", "gw-2", "gw-3")
 KILLED = "gw-2"
 LINES = 12
 DRIVES = 2  # drives per line
-WAIT_S = 60.0  # time limit of a step, in s; on an idle computer, a step takes a few seconds
+WAIT_S = 60.0  # time limit of a step; on an idle computer, a step takes a few seconds
 RUN_S = 2.0  # pause before the kill, and after each step
 KEEP = "100 MB"  # limit of stored samples; each server may store 256 MB in all
 
@@ -232,7 +232,7 @@ PR_SET_PDEATHSIG = 1  # option of prctl(2): the signal that a process gets when 
 # This shell command removes the folder when stdin is closed. It retries, because processes that are being
 # killed may still write into the folder.
 REMOVE = 'cat; for n in 1 2 3 4 5 6 7 8 9 10; do rm -rf "$0" && exit; sleep 1; done'
-ENDING_S = 10.0  # time limit, in s, for a process that was asked to exit
+ENDING_S = 10.0  # time limit for a process that was asked to exit
 NODES = ("n1", "n2", "n3")
 ATTEMPTS = 3  # attempts to start the servers; one fails if another program takes a server's port first
 STARTING_S = 20.0

@@ -124,7 +124,7 @@ async def _print_lines(arguments: argparse.Namespace, paths: list[ServerPath]) -
 # ---- the picture: everything important is shown by words, not only by colours ----
 
 
-OLD_S = 3.0  # s; a state of the fleet that is older is shown dimmed
+OLD_S = 3.0  # an older state of the fleet is shown dimmed
 NOTES = 4  # limit of the rows for notes, and of the rows for problems
 MOVES = 8  # limit of the rows that show how lines moved between gateways, if the lines fill the screen
 

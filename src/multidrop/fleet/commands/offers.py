@@ -119,11 +119,6 @@ class Prepared(NamedTuple):
     work: Callable[[], CommandResult]
 
 
-def commands_of(drive: Drive) -> list[str]:
-    """Return the drive's verbs that can be commanded through the fleet. Stops are sent without an offer."""
-    return [verb for verb in verbs_of(drive) if verb != "stop"]
-
-
 def prepare(drive: Drive, request: CommandRequest) -> Prepared:
     """Check a request, and return its command without sending it.
 
@@ -135,9 +130,9 @@ def prepare(drive: Drive, request: CommandRequest) -> Prepared:
 
 def _prepare_verb(drive: Drive, request: CommandRequest) -> Prepared:
     verb = request.verb
-    if verb not in commands_of(drive):
-        known = ", ".join(commands_of(drive)) or "none"
-        raise ValueError(f"{drive.name} has no verb {verb!r}; it has {known}")
+    known = [one for one in verbs_of(drive) if one != "stop"]  # a stop is sent without an offer
+    if verb not in known:
+        raise ValueError(f"{drive.name} has no verb {verb!r}; it has {', '.join(known) or 'none'}")
     arguments = verb_arguments(verb, request.options)
     if verb in _MOVING:
         drive.check_confirmed(verb)

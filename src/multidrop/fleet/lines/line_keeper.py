@@ -98,8 +98,8 @@ class LineKeeper:
     ) -> None:
         self.lines = lines
         self.polled: dict[str, TakenLine] = {}
-        self.troubles: dict[str, str] = {}  # by line: why the line could not be opened
-        self.lost: dict[str, str] = {}  # by line: how its port was lost, or why it cannot be opened
+        self.troubles: dict[str, str] = {}  # reasons why lines could not be opened, by line
+        self.lost: dict[str, str] = {}  # reasons why ports were lost or cannot be opened, by line
         self.unopened = UnopenedLines(lambda: lease.clock())
         self.releasing: set[str] = set()  # this gateway's lines that it must release to other gateways
         self.may_claim = True  # False while a gateway of an incompatible version is alive

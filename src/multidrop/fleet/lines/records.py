@@ -47,8 +47,9 @@ class FleetRecords:
             for bucket in names.OWNERS
         }
         self._of: dict[str, dict[str, Record | None]] = {}  # ownership records, by line and bucket
-        self._owned: dict[Owner, set[str]] = {}  # by session: lines with a record that names it
-        self._masters: dict[str, tuple[str, int]] = {}  # by line: its master, and the number of its last move
+        self._owned: dict[Owner, set[str]] = {}  # lines with a record that names the session, by session
+        # master of a line, and number of the line's last move, by line
+        self._masters: dict[str, tuple[str, int]] = {}
         self.plant = Follower(Bucket(names.PLANT, path), self._note_plant)
         self._has_plant_changed = False
         self._lines: tuple[str, ...] = ()

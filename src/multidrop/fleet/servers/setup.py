@@ -84,7 +84,9 @@ def check_clock(path: ServerPath, server_time: Any) -> None:
     if abs(apart) > CLOCKS_APART_S:
         _log.warning(
             "this machine's clock is %.0f s %s that of %s: set it, because samples get its time",
-            *(abs(apart), "ahead of" if apart > 0 else "behind", path.url),
+            abs(apart),
+            "ahead of" if apart > 0 else "behind",
+            path.url,
         )
 
 
