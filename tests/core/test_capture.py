@@ -174,7 +174,7 @@ def test_a_pause_ends_a_frame_that_starts_in_junk(first: str) -> None:
     assert b"".join(span.raw for span in spans if span.kind is Kind.JUNK) == ANSWER[:2] + junk
 
 
-def test_without_pauses_the_splitter_waits_for_the_rest_of_a_long_frame() -> None:
+def test_the_splitter_waits_for_the_rest_of_a_long_frame_if_pauses_are_unknown() -> None:
     stream, splitter = Stream(), Splitter()
     stream.put(bytes.fromhex("01 10 00 00 00 7B F6") + OTHER_READ, 0)
     assert list(splitter.spans(stream)) == []

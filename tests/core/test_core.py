@@ -665,7 +665,7 @@ def test_queued_exchanges_continue_after_a_silent_drive(drive: Drive) -> None:
         assert rows.of("status", 3) == [0, Status.NO_REPLY, 0]
 
 
-def test_a_request_is_not_sent_while_a_late_reply_could_pass_for_its_own(drive: Drive) -> None:
+def test_a_request_waits_while_a_late_reply_could_be_taken_for_its_reply(drive: Drive) -> None:
     slow = Peer(least_timeout=0.01, most_timeout=0.02)
     fd = drive(lambda request: b"" if request.start == 1 else echo_start(request))
     with closing(Port(fd, NO_SETTINGS)) as port:

@@ -202,7 +202,7 @@ def test_the_line_waits_for_the_end_of_a_reply_that_has_started(line: LineDriver
     assert line.completion.result == len(text)
 
 
-def test_after_a_failure_the_next_request_gets_the_longest_timeout(line: LineDriver, drive: Peer) -> None:
+def test_the_next_request_gets_the_longest_timeout_after_a_failure(line: LineDriver, drive: Peer) -> None:
     answer(line, drive, 2 * MS)
     given_up(line, drive)
     line.now = drive.late_until_ns
@@ -245,7 +245,9 @@ def test_a_reply_after_a_shortened_wait_is_recognised_as_late(line: LineDriver, 
     assert (drive.counters().late, drive.late_until_ns) == (1, 0)
 
 
-def test_no_request_is_sent_while_a_late_reply_could_pass_for_its_own(line: LineDriver, drive: Peer) -> None:
+def test_no_request_is_sent_while_a_late_reply_could_be_taken_for_its_reply(
+    line: LineDriver, drive: Peer
+) -> None:
     time_out(line, drive)
     line.begin(exchange(OTHER, drive))
     assert line.want == "done"
@@ -359,7 +361,7 @@ def delixi(function: int, start: int, value: int = 0) -> Message:
     ],
     ids=["another parameter", "the same one", "a state", "a state and a parameter", "a write", "a command"],
 )
-def test_a_delixi_request_waits_for_a_late_reply_that_could_be_its_own(
+def test_a_delixi_request_waits_for_a_late_reply_that_resembles_its_reply(
     line: LineDriver, drive: Peer, first: Message, second: Message
 ) -> None:
     line.send(exchange(first, drive, Framing.DELIXI))

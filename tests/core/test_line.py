@@ -794,7 +794,7 @@ def test_an_echo_before_the_usual_delay_is_not_a_value_of_0(
     assert line.echo == lib.MD_ECHO
 
 
-def test_after_two_copies_of_a_value_of_0_it_is_unknown_whether_the_adapter_echoes(line: LineDriver) -> None:
+def test_two_copies_of_a_query_do_not_show_whether_the_adapter_echoes(line: LineDriver) -> None:
     query(line)
     answer(line, ECHO + ECHO)
     assert line.completion.reply.data == bytes(4)

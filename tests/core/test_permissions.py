@@ -104,15 +104,15 @@ def test_an_ended_mastership_can_be_extended() -> None:
 def test_concurrent_extensions_keep_the_latest_deadline() -> None:
     mastership = Mastership()
     first = now_ns() + 200 * S
-    offers = [[first + 8 * n + thread for n in range(500)] for thread in range(8)]
+    deadlines = [[first + 8 * n + thread for n in range(500)] for thread in range(8)]
     threads = [
-        threading.Thread(target=lambda times=times: [*map(mastership.extend, times)]) for times in offers
+        threading.Thread(target=lambda times=times: [*map(mastership.extend, times)]) for times in deadlines
     ]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert mastership.until_ns == max(map(max, offers))
+    assert mastership.until_ns == max(map(max, deadlines))
     mastership.end()
 
 

@@ -226,7 +226,7 @@ def test_only_the_threads_that_pass_on_values_run_before_normal_threads(realtime
 
 @SHOWS_SCHEDULING
 @pytest.mark.usefixtures("_usual_nice")
-def test_without_permission_for_nice_values_one_warning_says_what_to_do(
+def test_one_warning_explains_how_to_permit_nice_values(
     realtime: Realtime, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(which: int, who: int, nice: int) -> None:
@@ -276,7 +276,7 @@ def test_the_cores_code_is_locked_in_memory(realtime: Realtime) -> None:
 
 
 @SHOWS_SCHEDULING
-def test_without_permission_the_poller_works_and_one_warning_says_what_to_do() -> None:
+def test_one_warning_explains_how_to_permit_realtime_scheduling() -> None:
     program = """
 import logging, os, resource
 from contextlib import suppress

@@ -287,7 +287,7 @@ def test_a_wrong_count_of_unsent_bytes_does_not_delay_other_drives(ends: Ends, p
 
 
 @pytest.mark.parametrize(("failures", "was_wrong", "seconds"), [(0, 0, 30), (1, 0, 40), (0, 1, 1), (1, 1, 1)])
-def test_after_a_stall_an_answering_drive_is_read_first(failures: int, was_wrong: int, seconds: int) -> None:
+def test_an_answering_drive_is_read_first_after_a_stall(failures: int, was_wrong: int, seconds: int) -> None:
     peer, line = Peer(least_timeout=1, most_timeout=1), LineDriver()
     peer.c.failures = failures
     line.begin(exchange(READ, peer=peer))

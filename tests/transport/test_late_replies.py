@@ -56,7 +56,7 @@ def is_barred(line: LineDriver, drive: Peer, request: Message) -> bool:
 
 
 @pytest.mark.usefixtures("proof")
-def test_no_read_is_sent_while_a_late_reply_could_be_mistaken_for_its_reply(
+def test_no_read_is_sent_while_a_late_reply_could_be_taken_for_its_reply(
     line: LineDriver, drive: Peer
 ) -> None:
     assert is_barred(line, drive, OTHER)

@@ -283,7 +283,7 @@ def vanishing_socket() -> tuple[str, Callable[[], None]]:
 
 
 @pytest.mark.slow
-def test_on_a_flooded_port_a_read_raises_the_error_no_reply() -> None:
+def test_a_read_on_a_flooded_port_raises_no_reply() -> None:
     master, slave = os.openpty()
     with Bus(os.ttyname(slave)) as bus:
         toy = bus.attach(Toy(1))

@@ -63,7 +63,7 @@ def test_the_buckets_of_delays_have_no_gap_between_them() -> None:
     assert all(high - low <= low / 8 for low, high in pairwise(edges[1:]))
 
 
-def test_without_replies_the_delays_are_0() -> None:
+def test_the_delays_are_0_if_there_are_no_replies() -> None:
     found = Statistics(1.0, Counters()).delays
     assert (found.replies, found.p50, found.p99, found.longest) == (0, 0, 0, 0)
 
