@@ -190,7 +190,7 @@ class RowForwarder(RetryingSender):
         self._position = SpoolPosition(max(0, state.oldest - 1))
         self._is_asked = False
         self._accepted = 0  # messages sent since the gateway's start
-        # number of messages sent when the receiver first refused a message, by number of that message
+        # value of `_accepted` at the first refusal of a message, by the message's number
         self._refusals: dict[int, int] = {}
         spool.acknowledge(self._position.newest)
         spool.on_message = self.announce

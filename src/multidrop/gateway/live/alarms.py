@@ -116,7 +116,7 @@ class Alarms:
         self._lasting: dict[tuple[str, str, str], Alarm] = {}
         self._ended: deque[Alarm] = deque(maxlen=MOST_ENDED)
         self._known: set[tuple[str, str]] = set()  # lines and drives whose state was seen before
-        # by drive, when its motor was first seen running: number of commands so far that can end a run
+        # number of commands that can end a motor's run, counted when it was first seen running; by drive
         self._runs: dict[str, int] = {}
         # time at which a motor was first seen at rest after running, by drive
         self._stands: dict[str, int] = {}

@@ -178,7 +178,8 @@ class Frames:
         self._clock = clock
         self._begin = begin
         self._kept: deque[dict[str, Any]] = deque(maxlen=KEPT)  # newest messages, the newest last
-        # the newest message to the page, encoded for viewers that have message N, by N; WHOLE: have none
+        # The newest message as bytes: its changes since an older message, by the number of the older message.
+        # The key WHOLE has the whole message.
         self._encoded: dict[int, Encoded] = {}
         self._due = 0.0
         self._timer: asyncio.TimerHandle | None = None
