@@ -25,9 +25,9 @@ from multidrop.supervisor import supervisor
 BUILD_S = 3.0  # in s: how long a start or a reload waits for parts that are being built
 END_S = 3.0  # time limit, in s, for closing one part, such as MQTT
 
-# By part: the Python module, which is imported if the plant file has the part's table. The module has
-# `Settings`, a frozen dataclass of the table's keys and their defaults, and `build(settings, context)`, which
-# returns a Part.
+# Python modules of the parts, by the name of the part's table. A module is imported if the plant file has the
+# table. It has `Settings`, a frozen dataclass of the table's keys and their defaults, and
+# `build(settings, context)`, which returns a Part.
 PARTS: Mapping[str, str] = {
     "fleet": "multidrop.fleet.page_part",
     "history": "multidrop.gateway.historian",
@@ -227,7 +227,7 @@ class LiveParts:
     # ---- one part ----
 
     async def _start_when_built(self, name: str, building: Building) -> None:
-        """Start a part once it is built, unless a reload or the shutdown has removed the part by then."""
+        """Start a part as soon as it is built, unless a reload or the shutdown has removed it meanwhile."""
         await asyncio.wait([building.part])
         if self.pending.get(name) is not building:
             return

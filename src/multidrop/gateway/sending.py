@@ -72,7 +72,7 @@ class _Answer(HTTPResponse):
 class _TimedBytes(io.RawIOBase):
     """The bytes that arrive at a socket.
 
-    Reading raises TimeoutError once this object is older than SEND_S.
+    A read raises TimeoutError if this object is older than SEND_S.
     """
 
     def __init__(self, raw: io.RawIOBase, sock: socket.socket) -> None:

@@ -423,7 +423,7 @@ class Pages(PageFiles):
 
 
 class FrameRoute:
-    """Answers `/api/frame?after=N` as soon as the newest frame's number differs from N."""
+    """Answers `/api/frame?after=N` as soon as the newest message has another number than N."""
 
     def __init__(self, frames: Frames) -> None:
         self._frames = frames

@@ -236,7 +236,7 @@ class Alarms:
                 self._take_up(alarm, time, names)
 
     def _take_up(self, alarm: Alarm, time: int, names: Collection[str]) -> None:
-        """Continue an alarm of an earlier run. End it if it is over, or if its drive or line was removed."""
+        """Continue an alarm of an earlier run. End it if its cause, its drive or its line has gone."""
         key = alarm.key
         present = self._lasting.get(key)
         is_seen = key[:2] in self._known and present is None
@@ -310,7 +310,7 @@ def _exceeded_in(text: str) -> set[str]:
 class Limit(NamedTuple):
     """An upper or lower limit of a polled value.
 
-    The limit is exceeded once the value has been beyond it for `lasting_s` seconds. It stays exceeded until
+    The limit is exceeded if the value has been beyond it for `lasting_s` seconds. It stays exceeded until
     the value is back by at least `hysteresis`, in the register's unit.
     """
 

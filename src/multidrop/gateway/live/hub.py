@@ -39,7 +39,7 @@ _STATES = {
 # are read one after the other, so it is inexact.
 LEAST_SLEEP_NS = 100_000_000
 FAULT_REGISTER = "fault"
-# in ns: if the motor still turns this long after the register of past faults has changed, the fault is over
+# in ns: if the motor still turns this long after the register of past faults has changed, no fault is shown
 RAN_NS = 3_000_000_000
 # the drive has replied if the status of a failed read starts with one of these texts
 _ANSWERED = ("exception ", "no valid value")

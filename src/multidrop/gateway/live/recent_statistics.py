@@ -86,7 +86,7 @@ class RecentStatistics:
         }
 
     def _use(self, name: str) -> tuple[float | None, float | None]:
-        """Return the used share of a line's time and its exchanges per second, over USE_S."""
+        """Return the used share of a line's bus time and its exchanges per second, over USE_S."""
         before = self._recent[0][1].get(name) if self._recent else None
         now = self.newest.get(name)
         if before is None or now is None or before is now or before.epoch != now.epoch:

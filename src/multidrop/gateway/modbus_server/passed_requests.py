@@ -32,7 +32,7 @@ from multidrop.gateway.modbus_server.settings import StopWrite, Unit
 from multidrop.gateway.modbus_server.words import STOP
 from multidrop.supervisor import supervisor
 
-SHARE = 0.2  # default share of a line's time that is used for requests of clients
+SHARE = 0.2  # default share of a line's bus time for requests of clients
 BURST_S = 0.2  # limit, in s, of unused bus time that is saved for later requests
 MOST_WAITING = 8  # limit of the requests that wait for one line
 EXPIRY_S = 1.0  # in s: a request that has waited for this long is dropped
@@ -55,7 +55,7 @@ class _WaitingRead:
 
 
 class LineShare:
-    """Sends the requests of clients on one line, one at a time, within a share of the line's time."""
+    """Sends the requests of clients on one line, one at a time, within a share of the bus time."""
 
     def __init__(self, share: float = SHARE) -> None:
         self._loop = asyncio.get_running_loop()
@@ -110,7 +110,7 @@ class LineShare:
     # ---- turns ----
 
     def _step(self) -> None:
-        """Start the next request now, or as soon as the share of the line's time allows it."""
+        """Start the next request now, or as soon as the share of bus time allows it."""
         if self._running is not None or not self._waiting:
             return
         now = self._loop.time()

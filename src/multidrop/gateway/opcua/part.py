@@ -41,7 +41,7 @@ EVERY_S = 0.1  # interval, in s, of passing new values to the server
 SWITCH_S = 0.0005
 # the interpreter's default of this time, 5 ms, which applies if no server runs
 USUAL_SWITCH_S = sys.getswitchinterval()
-# drives' states, which take 50 us each to compute, are passed on only once in this many intervals
+# The server gets the drives' states only in every tenth interval, because each takes 50 us to compute.
 STATE_TURNS = 10
 # in s: how long the answer to a stop waits for the motor; the client's other requests wait as well
 STOP_WAIT_S = 0.4
