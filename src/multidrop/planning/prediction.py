@@ -284,7 +284,10 @@ SLOWER = 1.05  # factor between one period that is tried and the next
 
 @dataclass(frozen=True)
 class Suggestions:
-    """Three changes to a line. Each one alone lets the line reach its rates; None if no change can."""
+    """Three changes to a line, each of which alone lets the line reach its rates.
+
+    `baudrate` and `registers` are None if no value of them is enough.
+    """
 
     every: tuple[tuple[float, float], ...]  # pairs of a wanted period and a period that can be reached, in s
     # lowest baud rate that is enough, and the drives that now have a lower one
