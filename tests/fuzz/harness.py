@@ -1,4 +1,4 @@
-"""Build a C harness for fuzzing, or for replaying its corpus."""
+"""Build a C harness for fuzzing, or for replaying its corpus. Read and write the corpora."""
 
 from __future__ import annotations
 
@@ -33,3 +33,30 @@ def _core() -> list[Path]:
     csrc = ROOT / "csrc"
     pure = [path for path in sorted(csrc.glob("*.c")) if path.stem not in NEEDING_A_SYSTEM]
     return [*pure, csrc / "system" / "clock.c"]
+
+
+# ---- corpora ----
+
+# each line: a parser, the name of an input, and the bytes of the input in hex
+CORPUS = HERE / "corpus.txt"
+
+
+def load(parser: str) -> dict[str, bytes]:
+    """Return the inputs in a parser's corpus, by name; {} if the parser has no corpus yet."""
+    inputs = (line.split(" ") for line in CORPUS.read_text("ascii").splitlines())
+    return {name: bytes.fromhex(text) for owner, name, text in inputs if owner == parser}
+
+
+def save(parser: str, inputs: dict[str, bytes]) -> None:
+    """Replace the corpus of a parser by these inputs."""
+    lines = CORPUS.read_text("ascii").splitlines(keepends=True)
+    others = [line for line in lines if not line.startswith(f"{parser} ")]
+    own = [f"{parser} {name} {data.hex()}\n" for name, data in inputs.items()]
+    CORPUS.write_text("".join(sorted(others + own)), "ascii")
+
+
+def unpack(parser: str, folder: Path) -> None:
+    """Write each input of a parser's corpus into a file of a new folder, as libFuzzer needs them."""
+    folder.mkdir()
+    for name, data in load(parser).items():
+        (folder / name).write_bytes(data)

@@ -10,7 +10,7 @@ import sys
 import tomllib
 from pathlib import Path
 
-import corpora
+import harness
 import pytest
 from commands import BoundProcess
 from harness import HERE, command
@@ -110,9 +110,9 @@ HARNESSES = sorted(path.stem.removeprefix("fuzz_") for path in HERE.glob("fuzz_*
 @pytest.mark.long
 def test_every_parser_has_a_small_fuzz_corpus() -> None:
     assert len(HARNESSES) == 6
-    owners = {line.split(" ")[0] for line in corpora.CORPUS.read_text("ascii").splitlines()}
+    owners = {line.split(" ")[0] for line in harness.CORPUS.read_text("ascii").splitlines()}
     assert owners == {*HARNESSES, *READERS}
-    inputs = [data for name in (*HARNESSES, *READERS) for data in corpora.load(name).values()]
+    inputs = [data for name in (*HARNESSES, *READERS) for data in harness.load(name).values()]
     assert len(inputs) > 500
     assert sum(map(len, inputs)) < 300_000
 
@@ -121,17 +121,17 @@ def test_every_parser_has_a_small_fuzz_corpus() -> None:
 def test_a_fuzz_corpus_is_unpacked_and_saved_unchanged(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    corpora.unpack("frame", tmp_path / "inputs")
+    harness.unpack("frame", tmp_path / "inputs")
     inputs = {path.name: path.read_bytes() for path in (tmp_path / "inputs").iterdir()}
-    text = corpora.CORPUS.read_bytes()
+    text = harness.CORPUS.read_bytes()
     copy = tmp_path / "corpus.txt"
     copy.write_bytes(text)
-    monkeypatch.setattr(corpora, "CORPUS", copy)
-    corpora.save("frame", {})
-    assert corpora.load("frame") == {}
-    corpora.save("frame", inputs)
+    monkeypatch.setattr(harness, "CORPUS", copy)
+    harness.save("frame", {})
+    assert harness.load("frame") == {}
+    harness.save("frame", inputs)
     assert copy.read_bytes() == text
-    assert corpora.load("no such parser") == {}
+    assert harness.load("no such parser") == {}
 
 
 @pytest.mark.long
@@ -142,16 +142,16 @@ def test_the_c_core_survives_the_inputs_of_its_fuzz_corpus(tmp_path: Path, name:
     build = command(name, tmp_path / name, "replay.c", CC, *STRICT, *SANITIZERS)
     built = subprocess.run(build, capture_output=True, text=True, check=False)
     assert built.returncode == 0, built.stderr
-    replay = [tmp_path / name, corpora.CORPUS, name]
+    replay = [tmp_path / name, harness.CORPUS, name]
     run = subprocess.run(replay, capture_output=True, text=True, check=False, timeout=60)
     assert run.returncode == 0, run.stderr[-3000:]
-    assert run.stderr.split() == list(corpora.load(name))
+    assert run.stderr.split() == list(harness.load(name))
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", READERS)
 def test_each_reader_survives_the_inputs_of_its_fuzz_corpus(tmp_path: Path, name: str) -> None:
-    for data in corpora.load(name).values():
+    for data in harness.load(name).values():
         read(name, data, tmp_path)
 
 
