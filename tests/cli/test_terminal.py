@@ -1,17 +1,29 @@
-"""The terminal: pictures and sparklines that fit its encoding and width, and keys from its bytes."""
+"""The terminal: pictures that fit its encoding and width, keys, and the live table of `poll` and `demo`."""
 
 from __future__ import annotations
 
+import argparse
+import logging
 import os
 import select
+import signal
 import sys
+import threading
 from io import BytesIO, StringIO, TextIOWrapper
+from pathlib import Path
 from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
-from lines import PATIENCE
+from commands import TOY_IS_RUN
+from lines import PATIENCE, until
+from recordings import recorded
 from tables import table
+from terminals import on_terminal
 
+from multidrop.cli import run
+from multidrop.cli.poll import Keys, LiveTable
+from multidrop.cli.support.polling import Triggering, trigger_picture
 from multidrop.cli.support.terminal import (
     DOWN,
     ENTER,
@@ -25,6 +37,11 @@ from multidrop.cli.support.terminal import (
     terminal_keys,
 )
 from multidrop.cli.support.values import columns_of
+from multidrop.control import exit_hook
+from multidrop.plant.loader import load_plant
+from multidrop.polling.batch import Row
+from multidrop.recording import open_writer
+from multidrop.recording.rows import from_rows
 
 
 def test_a_growing_history_keeps_its_points_in_the_same_sparkline_columns() -> None:
@@ -112,3 +129,205 @@ def test_a_closed_terminal_is_not_read_in_a_loop(monkeypatch: pytest.MonkeyPatch
             os.close(fd)
             with pytest.raises(OSError):  # noqa: PT011 (in the system's words)
                 wait_for_key(PATIENCE)
+
+
+@pytest.mark.slow
+@pytest.mark.long
+def test_on_a_terminal_a_demo_shows_the_monitor_until_its_time_has_passed(tmp_path: Path) -> None:
+    out = tmp_path / "demo.arrows"
+    with on_terminal("demo", "--out", out, "--seconds", 2, size=(120, 24)) as terminal:
+        terminal.wait_for(">pump-1")
+        terminal.wait_for_match(r"belts +8 ")
+        terminal.wait_for("multidrop demo --web")
+        terminal.wait_for(f"report {out}")
+        terminal.wait_for("scan /dev/ttyUSB0")
+        assert terminal.process.wait(timeout=60) == 0
+    assert "belt-3" in {row.drive for row in recorded(out)}
+
+
+@pytest.mark.long
+def test_on_a_terminal_poll_shows_the_newest_values_in_a_table(plant: Path) -> None:
+    with on_terminal("poll", plant, "--seconds", "1", size=(120, 24)) as terminal:
+        terminal.wait_for("DRIVE   SAMPLES  MISSES  NEWEST VALUES")
+        terminal.wait_for("output_current 0.00 A, mystery 0 raw, fault NONE, status none")
+        # the line of the second drive says "no reply" or "not asked"
+        terminal.wait_for("output_frequency: no")
+        terminal.wait_for("utilisation")
+        assert terminal.process.wait(timeout=60) == 0
+        assert b"\x1b[4F\x1b[J" in terminal.written  # table, head and note are drawn over the previous ones
+
+
+@pytest.mark.long
+def test_the_live_table_is_cut_to_the_size_of_its_terminal(plant: Path) -> None:
+    with on_terminal("poll", plant, "--seconds", "1", size=(40, 2)) as terminal:
+        terminal.wait_for("... and 3 more drives")
+        terminal.wait_for("utilisation")
+        assert terminal.process.wait(timeout=60) == 0
+        table = terminal.text.replace("\r\n", "\n").removeprefix(TOY_IS_RUN).partition("hall-1: ")[0]
+        assert max(map(len, table.splitlines())) < 40
+
+
+@pytest.mark.long
+@pytest.mark.slow
+def test_key_m_adds_a_comment_and_key_t_adds_a_trigger(plant: Path, tmp_path: Path) -> None:
+    options = ("--trigger", "key", "--pre", "10 s", "--post", "10 s", "--out", tmp_path / "trip.csv")
+    with on_terminal("poll", plant, *options, size=(100, 24)) as terminal:
+        terminal.wait_for("m: add a comment; t: trigger; Ctrl-C: end")
+        terminal.press("mkey j\x7fk, \u044f\r".encode())
+        terminal.press(b"t")
+        terminal.press(b"mnot this\x1b")
+        until(lambda: list(tmp_path.glob("trip.*.csv")))
+        terminal.process.send_signal(signal.SIGINT)
+        terminal.wait_for("1 trigger recorded")
+    rows = recorded(tmp_path / "trip.00000001.csv")
+    events = [(row.register, row.status) for row in rows if row.drive == "event"]
+    assert events == [("comment", "key k, \u044f"), ("trigger", "key t")]
+
+
+def test_key_m_without_a_recording_says_that_the_comment_would_be_lost() -> None:
+    poller, table = SimpleNamespace(mark=pytest.fail), SimpleNamespace(note="")
+    keys = Keys(cast(Any, poller), cast(Any, table), lambda seconds: "", has_trigger=False, is_recorded=False)
+    assert table.note == "Ctrl-C: end"
+    keys.press("m")
+    assert table.note.startswith("no comment: nothing is recorded; start poll with --out FILE")
+    keys.press("\r")
+
+
+@pytest.mark.long
+@pytest.mark.slow
+def test_terminal_shows_the_signal_around_the_last_trigger(plant: Path, tmp_path: Path) -> None:
+    condition = "integral(pump-1.output_current >= 0) > 0.3"
+    options = ("--trigger", condition, "--pre", "100 ms", "--post", "200 ms", "--out", tmp_path / "a.arrows")
+    with on_terminal("poll", plant, *options, size=(100, 24)) as terminal:
+        terminal.wait_for("^ from -0.1 s to 0.2 s")
+        terminal.process.send_signal(signal.SIGINT)
+        terminal.wait_for("1 trigger recorded")
+
+
+def test_the_picture_of_a_trigger_shows_its_moment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    about = {"condition": "a.i > 3", "time_ns": 2 * 10**9, "pre_s": 1.0, "post_s": 3.0}
+    registers = {"i": {"unit": "A"}, "u": {"unit": "V"}}
+    rows = [Row(at * 10**8, at, 0, "a", name, float(at == 25), "ok") for at in range(10, 40) for name in "iu"]
+    rows[0] = Row(10**9, 0, None, "a", "i", None, "no reply")
+    with open_writer(
+        tmp_path / "a.csv", {"trigger": about, "drives": {"a": {"registers": registers}}}
+    ) as file:
+        file.write(from_rows(rows))
+    how = Triggering(1.0, 3.0, {}, {"a.i > 3": [("a", "i")]})
+    assert trigger_picture(tmp_path / "a.csv", how, 55, "_#") == [
+        "trigger 00:00:02.000000 UTC: a.i > 3, in a.csv",
+        "a.i   ______________#________________________  0 to 1 A",
+        "               ^ from -1 s to 3 s",
+    ]
+    of_all = trigger_picture(tmp_path / "a.csv", how._replace(signals={}), 55, "_#")
+    assert [line[:3] for line in of_all] == ["tri", "a.i", "a.u", "   "]
+    assert trigger_picture(tmp_path / "none.csv", how, 55, "_#") == []
+    monkeypatch.setattr("multidrop.cli.support.polling.MOST_ROWS", len(rows) - 1)
+    (line,) = trigger_picture(tmp_path / "a.csv", how, 55, "_#")
+    assert line == "trigger 00:00:02.000000 UTC: a.i > 3, in a.csv, which is too large for a picture"
+
+
+# ---- the table of `poll` on a terminal: cut to the terminal's width, and redrawn in place ----
+
+
+DRIVE = '[[line.drive]]\nname = "{}"\nmodel = "invt-che"\naddress = 1\n'
+NO_ROWS: Any = ()
+WIDE_NAME = "\u4e3b\u6cf5-1"  # its first two characters take two columns each
+
+
+@pytest.fixture
+def size(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Return the terminal's columns and lines, in a list that a test may change."""
+    found = [80, 24]
+    terminal = SimpleNamespace(get_terminal_size=lambda: os.terminal_size(found))
+    # replaced in this module only, because pytest uses the original function
+    monkeypatch.setattr("multidrop.cli.poll.shutil", terminal)
+    return found
+
+
+def drawings(tmp_path: Path, encoding: str, size: list[int], *widths: int) -> list[str]:
+    """Return what is drawn on a terminal of each of these widths in turn."""
+    path = tmp_path / "plant.toml"
+    drive = DRIVE.format(WIDE_NAME)
+    path.write_text(f'[[line]]\nname = "hall"\nport = "x"\n{drive}poll = ["output_frequency"]\n', "utf-8")
+    terminal = TextIOWrapper(BytesIO(), encoding, errors="backslashreplace")
+    table = LiveTable(load_plant(path), terminal)
+    table.add(from_rows([Row(0, 0, 1000, WIDE_NAME, "output_frequency", 42.5, "ok")]))
+    found, before = [], 0
+    for size[0] in widths:
+        table.draw()
+        written = terminal.buffer.getvalue().decode(encoding)  # type: ignore[attr-defined]
+        found.append(written[before:])
+        before = len(written)
+    return found
+
+
+def test_a_line_cut_to_the_terminals_width_ends_with_a_mark(tmp_path: Path, size: list[int]) -> None:
+    whole, narrow = drawings(tmp_path, "utf-8", size, 80, 40)
+    head = "DRIVE   SAMPLES  MISSES  NEWEST VALUES\n"
+    assert whole == f"{head}{WIDE_NAME}        1       0  output_frequency 42.50 Hz\n"
+    assert narrow.endswith(f"{WIDE_NAME}        1       0  output_freque~\n")
+
+
+def test_a_wrapped_table_is_redrawn_after_the_terminal_narrowed(tmp_path: Path, size: list[int]) -> None:
+    """On a terminal of 40 columns, a line of 51 columns takes two rows, and the heading of 38 takes one."""
+    again = [text[: text.index("J") + 1] for text in drawings(tmp_path, "utf-8", size, 80, 80, 40)[1:]]
+    assert again == ["\x1b[2F\x1b[J", "\x1b[3F\x1b[J"]
+
+
+def test_the_live_table_shows_warnings_above_it_and_counts_no_channel_rows(
+    tmp_path: Path, size: list[int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "plant.toml"
+    drive = DRIVE.format("pump")
+    channel = '[[line.drive.channel]]\nname = "hertz"\nvalue = "output_frequency"\nunit = "Hz"\n'
+    path.write_text(f'[[line]]\nname = "hall"\nport = "x"\n{drive}{channel}')
+    table = LiveTable(load_plant(path), sys.stderr)
+    table.add(from_rows([Row(0, 0, 1000, "pump", "hertz", 42.5, "ok")]))
+    logger = logging.getLogger("multidrop.polling")
+    with table.showing_warnings():
+        table.draw()
+        logger.warning("pump.hours: 3 s are not counted")
+        table.draw()
+        logger.warning("the last one")
+    drawing = "DRIVE  SAMPLES  MISSES  NEWEST VALUES\npump         0       0  hertz 42.5 Hz\n"
+    warnings = "multidrop: pump.hours: 3 s are not counted\n", "multidrop: the last one\n"
+    assert capsys.readouterr().err == f"{drawing}\x1b[2F\x1b[J{warnings[0]}{drawing}{warnings[1]}"
+
+
+def test_a_name_that_cannot_be_encoded_moves_no_column(tmp_path: Path, size: list[int]) -> None:
+    (text,) = drawings(tmp_path, "ascii", size, 80)
+    assert "\\u" not in text
+    assert text.endswith("\n??-1        1       0  output_frequency 42.50 Hz\n")
+
+
+def test_a_message_printed_at_a_signal_stays_above_the_redrawn_table(
+    tmp_path: Path, size: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "plant.toml"
+    path.write_text(f'[[line]]\nname = "hall"\nport = "x"\n{DRIVE.format("pump")}')
+    terminal = StringIO()
+    monkeypatch.setattr(terminal, "isatty", lambda: True)
+    monkeypatch.setattr(sys, "stdout", terminal)
+    monkeypatch.setattr("multidrop.cli.poll.EVERY", 0.0)
+    monkeypatch.setattr(exit_hook, "_print_error", print)
+    monkeypatch.setattr(exit_hook, "_hook", hook := exit_hook.ExitHook())
+    before = signal.signal(signal.SIGTERM, lambda number, frame: None)
+    stopped = threading.Event()
+    act = hook.add(lambda: None, stopped.wait, lambda: ["pump"])
+    test: Any = SimpleNamespace(plan=SimpleNamespace(plant=load_plant(path)), phase="")
+    try:
+        with run._screen(test, argparse.Namespace(json=False)) as (show,):
+            show(NO_ROWS)
+            signal.raise_signal(signal.SIGTERM)
+            for _ in range(2):
+                show(NO_ROWS)
+    finally:
+        stopped.set()
+        hook.await_effect()
+        hook.finish(act)
+        signal.signal(signal.SIGTERM, before)
+    table = "DRIVE  SAMPLES  MISSES  NEWEST VALUES\npump         0       0\n"
+    again = f"stopping all drives\n{table}"
+    sentence = exit_hook.STOPPING.format("SIGTERM", "pump")
+    assert terminal.getvalue() == f"checking the drives\n{table}{sentence}\n{again}\x1b[3F\x1b[J{again}"
