@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager
 from functools import lru_cache
 from itertools import count
 from pathlib import Path
@@ -15,7 +15,6 @@ from batches import add_miss, add_rows, new_completion
 from nats_clusters import Cluster
 
 from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout, Status
-from multidrop.fleet.errors import FleetError
 from multidrop.fleet.samples import samples_stream
 from multidrop.fleet.samples.samples_stream import create_stream, samples_path
 from multidrop.fleet.servers.connections import ServerPath
@@ -91,8 +90,7 @@ def exchanges_in(rows: list[tuple[Any, ...]]) -> list[int]:
 async def empty_stream(servers: Cluster) -> AsyncIterator[ServerPath]:
     """Yield an open ServerPath to the servers, on which the stream of samples is empty."""
     async with samples_path(servers.urls) as path:
-        with suppress(FleetError):
-            await samples_stream._ask(path, "STREAM.DELETE.samples", {})
+        await samples_stream._ask(path, "STREAM.DELETE.samples", {}, samples_stream.NO_STREAM)
         await create_stream(path, replicas=1)
         yield path
 
