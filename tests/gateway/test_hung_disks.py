@@ -150,9 +150,7 @@ def test_a_hanging_history_query_is_reported(tmp_path: Path, monkeypatch: pytest
 
 
 @pytest.mark.long
-def test_a_disk_that_hangs_while_history_is_written_is_reported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_hanging_disk_of_the_history_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     go_on = threading.Event()
     with served(tmp_path, SERVE + HISTORY) as gateway:
         until(lambda: health(gateway)["status"] == "ok")

@@ -218,9 +218,7 @@ def test_no_message_is_lost_while_the_receiver_refuses_all_messages(clocked: Clo
     assert clocked.forwarder.refused == 0
 
 
-def test_the_forwarder_stores_a_limited_number_of_refusals(
-    clocked: Clocked, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_number_of_stored_refusals_is_limited(clocked: Clocked, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(forwarder_module, "MOST_REFUSALS", 2)
     test_no_message_is_lost_while_the_receiver_refuses_all_messages(clocked)
     assert [*clocked.forwarder._refusals] == [4, 5]

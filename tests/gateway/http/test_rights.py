@@ -451,9 +451,7 @@ def test_verbs_are_refused_over_modbus_even_if_the_settings_list_them() -> None:
     assert {rules[verb] for verb in VERBS} == {NEVER_THIS_WAY}
 
 
-async def test_the_limit_of_concurrent_writes_on_a_line_lets_stops_pass(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+async def test_the_limit_of_concurrent_writes_lets_stops_pass(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each write occupies a thread, so a blocked line could otherwise occupy any number of threads."""
     go_on = threading.Event()
 

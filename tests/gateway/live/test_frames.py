@@ -41,9 +41,7 @@ def frames(clock: Clock, made: list[int]) -> Frames:
     return Frames(make, clock)
 
 
-async def test_a_hundred_viewers_share_one_message_to_the_page(
-    frames: Frames, clock: Clock, made: list[int]
-) -> None:
+async def test_a_hundred_viewers_share_one_message(frames: Frames, clock: Clock, made: list[int]) -> None:
     first = await frames.after(-1)
     assert first is not None
     viewers = [asyncio.create_task(frames.after(first.n)) for _ in range(100)]
@@ -79,7 +77,7 @@ async def test_changes_between_two_messages_are_computed_once_for_all_viewers(
     assert compared == [1]
 
 
-async def test_at_most_five_messages_to_the_page_are_made_per_second(
+async def test_at_most_five_messages_are_made_per_second(
     frames: Frames, clock: Clock, made: list[int]
 ) -> None:
     seen = -1
@@ -97,9 +95,7 @@ async def test_at_most_five_messages_to_the_page_are_made_per_second(
     assert 45 <= len(made) <= 51
 
 
-async def test_rows_that_arrive_before_a_message_is_due_appear_in_the_next(
-    frames: Frames, clock: Clock
-) -> None:
+async def test_rows_that_arrive_before_a_message_is_due_are_in_the_next(frames: Frames, clock: Clock) -> None:
     """The next message to the page is made even if no further rows arrive."""
     first = await frames.after(-1)
     assert first is not None
@@ -113,9 +109,7 @@ async def test_rows_that_arrive_before_a_message_is_due_appear_in_the_next(
     assert second.n == 2
 
 
-def test_no_message_to_the_page_is_made_without_viewers(
-    frames: Frames, clock: Clock, made: list[int]
-) -> None:
+def test_no_message_is_made_without_viewers(frames: Frames, clock: Clock, made: list[int]) -> None:
     for _ in range(100):
         clock.now += 1.0
         frames.note_news()
@@ -162,9 +156,7 @@ plants = st.fixed_dictionaries(
 
 
 @given(plants, plants)
-def test_changes_applied_to_the_old_message_give_the_new_one(
-    before: dict[str, Any], now: dict[str, Any]
-) -> None:
+def test_changes_turn_the_old_message_into_the_new_one(before: dict[str, Any], now: dict[str, Any]) -> None:
     said = changes(before, now)
     assert merged(before, said) == now
     assert changes(before, merged(before, said)) == said
@@ -241,9 +233,7 @@ async def test_too_many_viewers_get_an_error(frames: Frames, monkeypatch: pytest
     assert json.loads(sent[1]["body"]) == {"error": "too many viewers; the limit is 0"}
 
 
-def test_messages_to_the_page_are_made_after_the_alarm_check(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_messages_are_made_after_the_alarm_check(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """At most every 0.2 s, the gateway checks drives for alarms and then makes a message to the page."""
     gateway = Gateway(written(tmp_path), ServeSettings(port=0))
     gateway.listener.close()

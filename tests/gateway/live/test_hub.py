@@ -358,9 +358,7 @@ def test_number_of_ended_alarms_that_are_kept_is_limited() -> None:
     assert len(events.shown()) <= 21
 
 
-def test_a_message_to_the_page_has_null_for_values_that_are_overdue_or_failed(
-    hub: Hub, clock: HubClock
-) -> None:
+def test_a_message_to_the_page_has_null_for_overdue_or_failed_values(hub: Hub, clock: HubClock) -> None:
     hub.take(rows((10, FREQUENCY, 25), (10, CURRENT, 12), (11, CURRENT, Status.NO_REPLY)))
     for now, frequency, current in (
         (12, [25.0], [None, "no reply", 12.0]),  # a failed read is shown immediately

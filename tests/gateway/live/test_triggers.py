@@ -107,9 +107,7 @@ def test_after_a_reload_conditions_are_evaluated_with_the_new_plant(tmp_path: Pa
 
 
 @pytest.mark.slow
-def test_the_http_route_of_triggers_returns_the_last_triggers(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_http_returns_the_last_triggers(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
     condition = "integral(pump-1.output_current >= 0) > 0.2"
     with served(tmp_path, f'[serve.trigger]\nconditions = {{ trip = "{condition}" }}\n') as gateway:

@@ -190,7 +190,7 @@ def test_viewing_a_silent_drive_reads_none_of_its_unpolled_registers(gateway: Se
 
 
 @pytest.mark.long
-def test_the_http_route_of_lines_returns_the_reply_delays_of_each_drive(gateway: Served) -> None:
+def test_http_returns_the_reply_delays_of_each_drive(gateway: Served) -> None:
     until(lambda: gateway.get("/api/lines").json["hall"]["minutes"])
     line = gateway.get("/api/lines").json["hall"]
     assert line["lost"] is None
@@ -360,9 +360,7 @@ MAY_STOP = '[serve.may]\nstop = "anyone"\n'
 
 
 @pytest.mark.long
-def test_a_stop_is_sent_without_another_read_of_the_identity(
-    tmp_path: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stop_is_sent_without_reading_the_identity(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """No identity is read between the call of the stop and the Modbus request that stops the drive."""
     asked: list[str] = []
     with served(tmp_path, MAY_STOP) as gateway:

@@ -190,9 +190,7 @@ def test_only_the_last_pending_birth_or_death_certificate_of_a_drive_is_sent(tmp
     assert [kind for kind, _ in sent[4:]] == ["DBIRTH", "DDATA"]
 
 
-def test_closing_the_gateway_publishes_a_death_certificate(
-    broker: Broker, host: Host, tmp_path: Path
-) -> None:
+def test_closing_the_gateway_sends_a_death_certificate(broker: Broker, host: Host, tmp_path: Path) -> None:
     require_module("paho.mqtt.client")
     settings = MqttSettings(broker.address, sparkplug="works", node="line")
     running = Running(build(settings, inside(tmp_path)))

@@ -158,9 +158,7 @@ def test_a_stops_result_does_not_replace_another_stops_question(opened: Opener, 
     assert [body for _, body in gateway.posts] == [{"drives": ["pump-1"]}, {"drives": None}]
 
 
-def test_stop_all_works_if_another_script_of_the_page_fails_to_load(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_stop_all_works_if_another_script_fails_to_load(opened: Opener, gateway: FakeGateway) -> None:
     """If one view cannot be loaded, no view is shown, but stops work."""
     broken = ("**/page/views/drives/table.js", "**/page/vendor/*", "**/api/frame*")
     page = opened(live=False, prepare=aborting(*broken))
@@ -350,9 +348,7 @@ def test_eight_tabs_with_six_connections_show_live_values_and_can_stop_drives(
 
 
 @pytest.mark.parametrize("case", ["a write that wants a token", "a reload"])
-def test_a_late_dialog_does_not_replace_the_dialog_of_a_stop(
-    opened: Opener, gateway: FakeGateway, case: str
-) -> None:
+def test_a_late_dialog_never_replaces_a_stop_dialog(opened: Opener, gateway: FakeGateway, case: str) -> None:
     """The answer to an earlier request arrives while the question is open."""
     path = "api/reload" if case == "a reload" else "api/write"
     held: list[Any] = []

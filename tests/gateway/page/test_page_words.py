@@ -176,9 +176,7 @@ def test_the_age_of_an_old_value_is_shown(opened: Opener) -> None:
     until_met(page, lambda: bool(re.fullmatch(r"\d+ min", row.locator(".age").inner_text())))
 
 
-def test_a_value_read_for_a_viewer_is_old_if_its_drive_is_silent(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_a_value_read_for_viewers_is_old_if_its_drive_is_silent(opened: Opener, gateway: FakeGateway) -> None:
     """A viewed register may be read only once a minute. Its value stays current while the drive answers."""
     page = opened()
     value = page.locator("#panel tr", has_text="run hours").locator(".value")
