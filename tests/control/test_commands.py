@@ -37,7 +37,6 @@ from multidrop.control.commands import (
     begin_stops,
     carry_out_verb,
     stop_drive,
-    stop_drive_by,
     stop_line,
     write_register,
 )
@@ -54,7 +53,6 @@ Stop = Callable[[InnovertIBD], Results]
 STOPS: dict[str, Stop] = {
     "the line": lambda drive: stop_line(lambda: drive.bus, [drive.name], None),
     "the drive": lambda drive: stop_drive(drive, None),
-    "another verb": lambda drive: stop_drive_by("stop", drive, None),
 }
 
 

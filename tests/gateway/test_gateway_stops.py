@@ -343,13 +343,13 @@ def test_many_stops_of_a_silent_drive_do_not_delay_the_stop_of_another(gateway: 
 @pytest.mark.slow
 def test_only_one_of_many_coasts_is_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     repeated: list[float | None] = []
-    stop = commands.stop_drive_by
+    stop = commands.stop_drive
 
-    def noted(verb: str, drive: Drive, seconds: float | None) -> Results:
+    def noted(drive: Drive, seconds: float | None, verb: str) -> Results:
         repeated.append(seconds)
-        return stop(verb, drive, seconds)
+        return stop(drive, seconds, verb)
 
-    monkeypatch.setattr(commands, "stop_drive_by", noted)
+    monkeypatch.setattr(commands, "stop_drive", noted)
     coast = {"drive": "pump-1", "verb": "coast", "options": {}}
     with served(tmp_path, MAY) as gateway, ThreadPoolExecutor(9) as callers:
         gateway.sims["pump-1"].deaf_until = float("inf")

@@ -88,13 +88,8 @@ def typed_value(register: Register[Any], value: float | str) -> Any:
     return register.decode(value)
 
 
-def stop_drive(drive: Drive, seconds: float | None) -> Results:
-    """Stop one drive; return a dict that maps the drive's name to the result."""
-    return stop_drive_by("stop", drive, seconds)
-
-
-def stop_drive_by(verb: str, drive: Drive, seconds: float | None) -> Results:
-    """Stop one drive with this verb, such as `coast`; return a dict that maps its name to the result."""
+def stop_drive(drive: Drive, seconds: float | None, verb: str = "stop") -> Results:
+    """Stop one drive, for example with the verb `coast`; return a dict that maps its name to the result."""
     if not drive.has_motor:
         return {drive.name: result_of_stop(Stopped(drive.name, Seen.NO_MOTOR, 0.0))}
     try:

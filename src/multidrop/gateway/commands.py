@@ -23,7 +23,7 @@ from multidrop.control.commands import (
     RepeatedStops,
     begin_command,
     carry_out_verb,
-    stop_drive_by,
+    stop_drive,
     stop_line,
     write_register,
 )
@@ -113,7 +113,7 @@ class Commands:
         self.stops: Counter[str] = Counter()  # number of stops called, by drive
         # time at which a drive's latest stop was called (CLOCK_BOOTTIME, ns), by drive
         self._stopped_ns: dict[str, int] = {}
-        self._repeated = {verb: RepeatedStops(partial(stop_drive_by, verb)) for verb in STOPPING}
+        self._repeated = {verb: RepeatedStops(partial(stop_drive, verb=verb)) for verb in STOPPING}
         self._repeated["stop"] = RepeatedStops()
         # time at which a drive's latest command or stop ended (CLOCK_MONOTONIC, ns), by drive
         self._ended_ns: dict[str, int] = {}

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 from multidrop import Bus, Drive, WriteForbidden
 from multidrop.control import CommandOutcome, CommandResult
-from multidrop.control.commands import carry_out_verb, stop_drive_by, typed_value, write_register
+from multidrop.control.commands import carry_out_verb, stop_drive, typed_value, write_register
 from multidrop.drive import verb_arguments, verbs_of
 from multidrop.fleet.commands.messages import CommandAnswer, CommandRequest
 from multidrop.fleet.lines.rules import SECOND
@@ -141,7 +141,7 @@ def _prepare_verb(drive: Drive, request: CommandRequest) -> Prepared:
     options = "".join(f", {name} = {getattr(value, 'value', value)}" for name, value in arguments.items())
     text = f"{drive.name}: {verb}{options}"
     if verb not in _MOVING:
-        return Prepared(text, lambda: stop_drive_by(verb, drive, None)[drive.name])
+        return Prepared(text, lambda: stop_drive(drive, None, verb)[drive.name])
     return Prepared(text, partial(carry_out_verb, drive, verb, arguments))
 
 
