@@ -196,7 +196,10 @@ def test_an_old_value_is_marked_if_other_values_are_new(watched: LivePlant) -> N
     watched.add(from_rows([row("drive-1", "output_frequency", None, "exception 02", ago=0)]))
     at = Position()
     shown = [texts(overview(watched, at, (80, 24), after(wait), BLOCKS))[3] for wait in (0, SECOND)]
-    assert [" 42.50 Hz " in line for line in shown] == [True, False]  # one miss does not make a value old
+    assert [" 42.50 Hz " in line for line in shown] == [
+        True,
+        False,
+    ]  # one missed value does not make the last value old
     assert shown[1].split()[1:8] == ["running", "?42.50", "Hz", "2.5", "A", "1.5", "s"]
 
 

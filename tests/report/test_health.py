@@ -1,4 +1,4 @@
-"""Recordings in memory and the figures computed from them: delays, misses, utilisation of lines."""
+"""Recordings in memory and the figures computed from them: delays, missed values, utilisation of lines."""
 
 from __future__ import annotations
 

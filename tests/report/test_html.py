@@ -215,7 +215,7 @@ def by_pandas(table: Any, edge: float, step: float) -> tuple[Any, ...]:
     settling = (later.index[0] if len(outside) else 0.0) if len(later) else None
     frame = known.reset_index()
     slope = frame.s.cov(frame.value) / frame.s.var()
-    mean_power = inside.value.rolling(2).mean()  # mean power between two rows; NaN beside a miss
+    mean_power = inside.value.rolling(2).mean()  # mean power between two rows; NaN beside a missed value
     energy = (mean_power * inside.s.diff()).sum() / 3600
     return known.count(), known.mean(), known.min(), known.max(), settling, slope, energy
 

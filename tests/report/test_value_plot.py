@@ -201,7 +201,7 @@ def test_states_are_drawn_in_a_lane_per_drive_with_its_names(tmp_path: Path) -> 
         "erman": [("stopped", 0, 1), ("accelerating", 1, 2), ("running", 2, 3), ("decelerating", 3, 5)],
         "che": [("standby", 0, 2), ("forward", 2, 3), ("standby", 4, 5), ("", 5, 5)],
     }
-    (ticks,) = axes.lines  # the mark of the miss, in its drive's lane
+    (ticks,) = axes.lines  # the mark of the missed value, in its drive's lane
     assert ticks.get_ydata()[0] == pytest.approx(1.4)
     assert [text.get_text() for text in axes.get_legend().get_texts()] == ["code 7"]
 

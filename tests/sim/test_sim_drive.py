@@ -290,8 +290,8 @@ RATING = Rating(frequency=50, voltage=400, current=10, power=4, torque=26, pole_
 @pytest.fixture
 def motor() -> Motor:
     motor = Motor(RATING)
-    motor.acceleration_time = 10  # s from 0 to 50 Hz, so 5 Hz/s
-    motor.deceleration_time = 5  # s from 50 Hz to 0, so 10 Hz/s
+    motor.acceleration_time = 10  # seconds from 0 to 50 Hz, so 5 Hz/s
+    motor.deceleration_time = 5  # seconds from 50 Hz to 0, so 10 Hz/s
     motor.target = 40
     return motor
 

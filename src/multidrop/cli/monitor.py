@@ -52,7 +52,7 @@ from multidrop.recording.triggered import TriggeredWriter
 from multidrop.transport import clock
 
 DRAW_S = 0.25
-SCROLL_S = 2.0  # s between two pictures on a terminal without cursor control
+SCROLL_S = 2.0  # seconds between two pictures on a terminal without cursor control
 PAGE = 10  # number of lines that a page key scrolls
 _STOP_KEYS = ("s", "S")
 STILL_STOPPING = "waiting for a stop in progress; press Ctrl-C repeatedly to leave, and watch the motors"

@@ -74,7 +74,7 @@ def widest(files: list[HistoryFile]) -> list[HistoryFile]:
 class Listing:
     """The current files of a history; each row is in exactly one file."""
 
-    segments: dict[int, Path] = field(default_factory=dict)  # by number: segments that are not in `rows`
+    segments: dict[int, Path] = field(default_factory=dict)  # segments that are not in `rows`, by number
     rows: dict[int, HistoryFile] = field(default_factory=dict)
     tens: list[HistoryFile] = field(default_factory=list)
 

@@ -78,7 +78,7 @@ MOST_NAMES = {DRIVE: 1 << 16, REGISTER: 1 << 16, STATUS: MOST_NARROW}  # limit o
 
 Names = tuple[str, ...]
 Column = Any  # memoryview, array or bytes: anything with a buffer
-Codes = dict[int, tuple[Column, Names]]  # by dictionary id: the code of each row, and the codes' names
+Codes = dict[int, tuple[Column, Names]]  # codes of the rows, and names of the codes, by dictionary id
 
 
 def schema_message(metadata: dict[bytes, bytes]) -> bytes:

@@ -96,7 +96,7 @@ class AppendingWriter(RecordingWriter):
             self._file.close()
 
 
-_REASONS = {  # by exception of a library: what is wrong with the file
+_REASONS = {  # defects of a file, by the exception that a library raises for them
     UnicodeDecodeError: "a text is not UTF-8",
     struct.error: "the stated lengths do not match the data",
     RuntimeError: "the stated lengths do not match the data",  # from nanoarrow

@@ -214,7 +214,7 @@ class LineUse:
     line: str
     planned: Mapping[str, Any]
     time: Array  # times of the exchanges, ns UTC
-    needed: Array  # s for request, delay, reply and silence; at most the measured time
+    needed: Array  # seconds for request, delay, reply and silence; at most the measured time
     asked: Mapping[str, int]  # number of answered exchanges, by drive
     seconds: float
     # time in s to read each register once; None if there are no values, or if a register has its own rate
@@ -308,14 +308,11 @@ def _exchanges(recording: Recording, name: str, drive: Mapping[str, Any]) -> tup
     blocks, which = np.unique(np.stack([function[first], start, end - start]), axis=1, return_inverse=True)
     framing = Framing[recording.about(name)["framing"].upper()]
     requests = [Message(1, asked, at, count, bytes(4)) for asked, at, count in blocks.T.tolist()]
-    characters = np.array([_characters(framing, request) for request in requests])[which]
+    replies = [characters_on_wire(framing, reply_length(framing, request)) for request in requests]
+    characters = np.array(replies)[which]
     # Rows have only the times of the request's start and of the reply's first character, so add the rest.
     rest = (characters - 1) * drive["character_ms"] / 1e3
     return time, uncertainty / 1e9 + rest, len(times)
-
-
-def _characters(framing: Framing, request: Message) -> int:
-    return characters_on_wire(framing, reply_length(framing, request))
 
 
 def draw_utilisation(uses: Sequence[LineUse], recording: Recording) -> Figure:

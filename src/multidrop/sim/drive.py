@@ -177,7 +177,7 @@ PROTOCOLS = {Framing.RTU: MODBUS, Framing.ASCII: MODBUS, Framing.TCP: MODBUS, Fr
 
 
 MOST_REMEMBERED = 10_000  # limit of a drive's recorded writes, to save memory
-# by function code of a write: the function code of a read with the same length limit
+# function codes of reads, by the function code of a write with the same length limit
 _COUNTED_AS = {0x06: 0x03, 0x10: 0x03}
 # Longest silence within a frame, in s. Sources: the Modbus serial-line guide, 2.5.2.1; the third part of
 # Delixi's document; for TCP an assumed long time.

@@ -409,13 +409,13 @@ YD_TIMEOUT_SETTING = 0x0803
     YD_DC_BRAKE,
     YD_SECOND_RAMP,
 ) = (1 << bit for bit in range(15, 5, -1))
-# by control bit: the value that it adds to the number of the preset speed
+# values that are added to the number of the preset speed, by control bit
 YD_PRESET_BITS = {1 << 3: 1, 1 << 2: 2, 1 << 1: 4, 1 << 0: 8}
 # addresses of the parameters Sr1 to Sr7
 YD_PRESET_SPEEDS = (0x0018, 0x0019, 0x0020, 0x0021, 0x0022, 0x0023, 0x0024)
 YD_PANEL_ONLY = (0x0001, 0x0007, 0x0015)
 YD_BAUDRATES = (1200, 2400, 4800, 9600)  # baud rates, indexed by F800
-YD_RESTART_TIME = 2.0  # s after a reset during which requests are ignored
+YD_RESTART_TIME = 2.0  # seconds after a reset in which requests are ignored
 YD_EMERGENCY_STOPPED, YD_COMMUNICATION_LOST = 0x11, 0x18
 YD_HELD = (0x1200, 0x1201)  # addresses of the registers that are frozen from a trip until the reset
 

@@ -19,7 +19,7 @@ from multidrop.drive.number_format import arranged, bits_of
 from multidrop.drive.register import Access, Carrier, Register, Table
 from multidrop.drive.text import Text
 
-# by function code that writes one cell: the code that writes several
+# function codes that write several cells, by the code that writes one cell
 _ALSO_WRITES = {0x05: 0x0F, 0x06: 0x10}
 # the function codes 05 (RAM) and 06 (EEPROM) write the same parameters
 _DELIXI_ALSO_WRITES = {0x05: 0x06, 0x06: 0x05}

@@ -458,7 +458,7 @@ class SimulatedOptidrive(ProfileDrive):
     read_handlers = {"status": _state}
 
 
-# by profile: the class that simulates its drives
+# classes that simulate drives, by profile
 PROFILE_DRIVES: Mapping[type[Drive], type[ProfileDrive]] = {
     Profidrive: SimulatedProfidrive,
     CiA402: SimulatedCiA402,

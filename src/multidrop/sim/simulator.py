@@ -42,9 +42,9 @@ class Simulator:
         self._is_over = False
         self._is_open = False
         self._wakes: list[tuple[float, int]] = []  # heap of pairs: wake-up time in s, index of the wire
-        # by index of the wire: the time of its next wake-up; other times in the heap are obsolete
+        # next wake-up times, by index of the wire; other times in the heap are obsolete
         self._planned: dict[int, float] = {}
-        # by index of the wire: the port that the selector observes, and its descriptor
+        # ports that the selector observes and their descriptors, by index of the wire
         self._attended: dict[int, tuple[SimulatedEnd, int]] = {}
 
     def __enter__(self) -> Self:

@@ -22,9 +22,9 @@ from multidrop.sim.drive import SimulatedDrive
 from multidrop.sim.receiver import Frame, Receiver
 from multidrop.transport.port_identity import SimulatedPort, is_simulated, of_address
 
-CHUNK = 1e-3  # s; characters that end within this time are delivered together
+CHUNK = 1e-3  # characters that end within this time, in s, are delivered together
 ROUNDING = 1e-6  # rounding errors below this fraction of a character's time do not delay a byte
-UNPACED_GAP = 20e-3  # s of silence that end a frame on an unpaced wire
+UNPACED_GAP = 20e-3  # seconds of silence that end a frame on an unpaced wire
 
 
 @dataclass

@@ -112,7 +112,7 @@ def polling_session(
             hand_out()  # even after a failure, hand out the rows that the poller has delivered
 
 
-POINT_S = 0.25  # s between two points of a history
+POINT_S = 0.25  # seconds between two points of a history
 HISTORY = 240  # most points of a history, which are those of the last minute
 RECENT = 5.0  # period in s over which rates are measured
 MISSED = 1.0  # if the last request for a register failed, its value is old after this many s
@@ -142,7 +142,7 @@ class LiveDrive:
     line: PlantLine
     polled: PolledDrive
     cycle: float = 0.0  # planned cycle time of the drive's line, in s
-    line_utilisation: float = 1.0  # planned utilisation; at 1 and above, polling leaves no spare line time
+    line_utilisation: float = 1.0  # planned utilisation; at 1 and above, polling leaves no spare bus time
     newest: dict[str, Row] = field(default_factory=dict)  # each register's newest sample
     # each register's last missed value, if newer than its newest sample
     missed: dict[str, Row] = field(default_factory=dict)
