@@ -134,6 +134,25 @@ def test_hdf5_has_the_rows_of_the_recording(tmp_path: Path) -> None:
         assert json.loads(file["metadata"][()]) == METADATA
 
 
+def test_time_in_a_group_of_mdf4_never_decreases_although_the_clock_was_set_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from asammdf import MDF
+
+    monkeypatch.setattr("multidrop.recording.series.PIECE_ROWS", 100)
+    times = [at if at < 150 else at - 149 for at in range(300)]
+    source = record(tmp_path / "a.arrows", [row(at, "pump", "speed", float(at)) for at in times], ABOUT)
+    convert(source, tmp_path / "a.mf4")
+    found: list[float] = []
+    with MDF(tmp_path / "a.mf4") as mdf:
+        for group in range(len(mdf.groups)):
+            signal = mdf.get("pump.speed", group=group)
+            assert sorted(signal.timestamps) == signal.samples.tolist() == signal.timestamps.tolist()
+            assert set(mdf.get("pump.speed.status", group=group).samples) == {b"ok"}
+            found += signal.samples.tolist()
+    assert sorted(found) == sorted(times)
+
+
 def test_exports_have_the_names_of_negative_values(tmp_path: Path) -> None:
     import h5py
     from asammdf import MDF

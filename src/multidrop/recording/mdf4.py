@@ -26,6 +26,8 @@ UNNAMED = "unnamed"  # text for a number without a name, such as a fault code th
 class Mdf4Writer(SeriesWriter):
     """Writes a channel group for each register: its time, value, status and uncertainty.
 
+    If the computer's clock was set back, a register may have several groups.
+
     Until `close`, asammdf keeps the rows in a temporary file beside `path`.
     """
 
@@ -33,7 +35,8 @@ class Mdf4Writer(SeriesWriter):
         super().__init__(path, metadata)
         described = dump_metadata(metadata)
         self._mdf: Any = None
-        self._groups: dict[tuple[str, str], int] = {}
+        # for each register: its newest channel group, and the time of that group's last row, in ns UTC
+        self._groups: dict[tuple[str, str], tuple[int, int]] = {}
         with writing(path):
             new_file(path).close()
             self._open(partial(self._begin, metadata, described))
@@ -51,7 +54,10 @@ class Mdf4Writer(SeriesWriter):
         time = self._seconds(rows.time)
         status = rows.status.astype(np.uint16)
         uncertainty = rows.uncertainty_ns / 1e9
-        if (group := self._groups.get(rows[:2])) is not None:
+        group, last_ns = self._groups.get(rows[:2], (None, 0))
+        # The time in a group must not decrease, so after a clock was set back, the rows have a new group.
+        if group is not None and rows.time[0] >= last_ns:
+            self._groups[rows[:2]] = group, int(rows.time[-1])
             channels = (time, None), (rows.value, missed), (status, None), (uncertainty, missed)
             self._mdf.extend(group, channels)
             return
@@ -72,9 +78,10 @@ class Mdf4Writer(SeriesWriter):
             Signal(uncertainty, time, name=f"{name}.uncertainty", unit="s", invalidation_bits=missed),
         ]
         about_drive = f"{drive.get('model', '')}, line {drive.get('line', '')}"
-        self._groups[rows[:2]] = self._mdf.append(
+        made = self._mdf.append(
             signals, acq_name=rows.drive, comment=printable(about_drive), common_timebase=True
         )
+        self._groups[rows[:2]] = made, int(rows.time[-1])
 
     def _seconds(self, time: Array) -> Array:
         return np.asarray((time - self.begin_ns) / 1e9)
@@ -93,8 +100,8 @@ class Mdf4Writer(SeriesWriter):
     def _finish(self) -> None:
         self._mdf.header.abs_time = self.begin_ns or 0
         names = _names(dict(enumerate(self.statuses)))
-        for group in self._groups.values():
-            self._mdf.groups[group].channels[STATUS].conversion = names
+        for group in self._mdf.groups:
+            group.channels[STATUS].conversion = names
         with self.path.open("wb+") as file:
             self._mdf.save(file)
 
