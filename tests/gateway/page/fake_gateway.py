@@ -301,7 +301,7 @@ def alarms(handler: Any, gateway: FakeGateway, asked: dict[str, list[str]]) -> N
     start, end = float(asked["from"][0]), float(asked["to"][0])
     found = fake_plant.alarms(gateway.renamed, gateway.began)
     found = gateway.changes.get("alarms", found)
-    told = [a for a in found if a["time"] < end and (a["ended"] or math.inf) > start]
+    told = [a for a in found if a["time"] < end and max(a["time"], a["ended"] or math.inf) > start]
     handler.tell({"alarms": [*map(as_answer, told)], "since": iso_time(gateway.knows_since)})
 
 

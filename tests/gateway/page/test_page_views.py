@@ -449,6 +449,18 @@ def test_time_before_the_start_is_not_shown_as_free_of_faults(opened: Opener, ga
     assert all(abs(part - 0.5) < 0.02 for part in lanes.evaluate_all(part))
 
 
+def test_an_alarm_during_which_the_clock_was_set_back_has_a_bar(opened: Opener, gateway: FakeGateway) -> None:
+    """The clock was set back by an hour, so the alarm ended before the shown hour started."""
+    start, end = 1764077400000, 1764074400000
+    gateway.changes["alarms"] = [fake_plant.alarm(start, "pump-2", "overheating", end, "fault")]
+    page = opened("#/trends?drive=pump-2&from=1764075600000&to=1764079200000")
+    bar = page.locator("#lane .fault", has_text="overheating")
+    bar.wait_for()
+    assert float(bar.evaluate("bar => bar.offsetLeft / bar.parentNode.clientWidth")) == pytest.approx(
+        0.5, abs=0.02
+    )
+
+
 def test_a_register_recorded_in_a_second_unit_has_a_second_plot(opened: Opener, gateway: FakeGateway) -> None:
     gateway.recorded = {
         "pump-1.output_current": {"unit": "%", "left_out": ["A", ""]},

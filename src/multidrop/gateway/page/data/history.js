@@ -3,6 +3,7 @@
 import { said, t } from "../texts.js";
 import { unit } from "../ui/values.js";
 import { Refused, get, query } from "./api.js";
+import { now } from "./link.js";
 import { alarms, holdsFor, store, withMs } from "./store.js";
 
 export const label = (drive, register) => `${drive}.${register}`;
@@ -90,6 +91,10 @@ export async function readAlarms(from, to) {
     told.alarms.forEach(withMs);
     return [told.alarms, Date.parse(told.since)];
   } catch {
-    return [alarms().filter(alarm => (alarm.ended ?? Infinity) > from && alarm.time < to), null];
+    return [alarms().filter(alarm => endOf(alarm) > from && alarm.time < to), null];
   }
 }
+
+// Return an alarm's end, or the present time for an active alarm. If the clock was set back during the alarm,
+// the start counts as the end.
+export const endOf = alarm => Math.max(alarm.time, alarm.ended ?? now());

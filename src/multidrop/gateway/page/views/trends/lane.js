@@ -1,7 +1,6 @@
 // Alarms as bars, drawn over the time axis of the trends.
 
-import { readAlarms } from "../../data/history.js";
-import { now } from "../../data/link.js";
+import { endOf, readAlarms } from "../../data/history.js";
 import { store } from "../../data/store.js";
 import { said, t } from "../../texts.js";
 import { fill, glyph, make, named } from "../../ui/dom.js";
@@ -26,9 +25,7 @@ export async function draw(place, from, to, drives) {
   fill(
     place,
     LANES.map(([title, kinds]) => {
-      const there = alarms.filter(
-        alarm => kinds.includes(alarm.kind) && (alarm.ended ?? now()) > from && alarm.time < to,
-      );
+      const there = alarms.filter(alarm => kinds.includes(alarm.kind));
       return make(
         "div",
         { class: "lane" },
@@ -65,7 +62,7 @@ function bar(alarm, from, to) {
     `: ${what}`,
   );
   const start = Math.max(0, (alarm.time - from) / (to - from)),
-    end = Math.min(1, ((alarm.ended ?? now()) - from) / (to - from));
+    end = Math.min(1, (endOf(alarm) - from) / (to - from));
   shown.style.left = `${start * 100}%`;
   shown.style.width = `${Math.max(0.3, (end - start) * 100)}%`;
   return shown;
