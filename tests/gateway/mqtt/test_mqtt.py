@@ -24,6 +24,7 @@ from peers import require_module
 from tables import in_turn, table
 
 from multidrop import Drive, InvtCHE, PolledDrive
+from multidrop.channels import Channel
 from multidrop.control import CommandOutcome, CommandResult
 from multidrop.drive.number_format import NumberFormat
 from multidrop.drive.register import reading, setting
@@ -522,12 +523,25 @@ class Meter(Drive):
     title = "ACME M-1"
     net_energy = reading(0x0000, "kWh", number_format=NumberFormat.I32)
     total_energy = reading(0x0002, "kWh", number_format=NumberFormat.U32)
+    float_energy = reading(0x0004, "kWh", number_format=NumberFormat.F32)
+    generated = reading(0x0006, "MWh", number_format=NumberFormat.U32)
 
 
 def test_only_an_energy_that_cannot_fall_is_declared_as_increasing() -> None:
-    parts = configured(Meter(1), ["net_energy", "total_energy"], [])["cmps"]
-    assert parts["net_energy"]["state_class"] == "total"
-    assert parts["total_energy"]["state_class"] == "total_increasing"
+    names = ["net_energy", "total_energy", "float_energy", "generated"]
+    meter = Meter(1)
+    parts = configured(meter, names, [])["cmps"]
+    classes = ["total", "total_increasing", "total", "total_increasing"]
+    assert [parts[name]["state_class"] for name in names] == classes
+    assert {parts[name]["device_class"] for name in names} == {"energy"}
+
+
+def test_the_computed_energy_of_a_channel_may_fall() -> None:
+    topics = {name: name for name in ("state", "gateway", "available", "set", "stop")}
+    details: Any = {"prefix": "works", "version": "1", "every_s": 1.0, "takes_commands": True}
+    energy = Channel("energy", "integral(output_power)", "kWh").register
+    parts = json.loads(discovery(Meter(1), [energy], topics, writable=[], **details))["cmps"]
+    assert parts["energy"]["state_class"] == "total"
 
 
 # For each platform: the keys that Home Assistant requires, and the optional keys that we use. Source: Home

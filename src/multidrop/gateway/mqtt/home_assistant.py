@@ -23,7 +23,7 @@ CLASSES = {  # device_class of a sensor in Home Assistant, by unit
     "V": "voltage",
     "kW": "power",
     "W": "power",
-    "kWh": "energy",
+    **dict.fromkeys(("Wh", "kWh", "MWh", "J", "kJ", "MJ"), "energy"),
     "°C": "temperature",
     "h": "duration",
     "s": "duration",
@@ -155,15 +155,20 @@ def _sensor(name: str, register: Register[Any]) -> dict[str, Any]:
         found["unit_of_measurement"] = register.unit
         if register.unit in CLASSES:
             found["device_class"] = CLASSES[register.unit]
-        found["state_class"] = "measurement" if register.unit != "kWh" else _total(register)
+        is_energy = found.get("device_class") == "energy"
+        found["state_class"] = _total(register) if is_energy else "measurement"
         if (digits := digits_of(register)) is not None:
             found["suggested_display_precision"] = digits
     return found
 
 
 def _total(register: Register[Any]) -> str:
-    """Return the state class of an energy. Home Assistant takes a fall of "total_increasing" for a reset."""
-    return "total" if register.number_format in SIGNED else "total_increasing"
+    """Return the state class of an energy. Home Assistant takes a fall of "total_increasing" for a reset.
+
+    An energy with a sign may be a net energy, which falls. So may a float, and a channel.
+    """
+    may_fall = register.is_float or register.number_format in SIGNED
+    return "total" if may_fall else "total_increasing"
 
 
 def _written(name: str, register: Register[Any], topic: str) -> dict[str, Any]:
