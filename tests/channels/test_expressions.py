@@ -149,6 +149,28 @@ def test_mistake_in_a_channel_expression_is_reported_with_its_column(expression:
 
 
 @table(
+    "expression, unit, hint",
+    [
+        ('as(current * 400, "KW")', "KW", 'the unit KW is not known; did you mean "kW"?'),
+        ('table(current, "M3/h", 0, 0, 1, 2)', "M3/h", ""),
+        ('table(current, "L/Min", 0, 0, 1, 2)', "l/min", 'the unit Min is not known; did you mean "min"?'),
+        ("if(current > 1, 5, 3)", "KW", 'the unit KW is not known; did you mean "kW"?'),
+        ("integral(power)", "KWh", 'the unit KWh is not known; did you mean "kWh"?'),
+        ("power / 1000", "Mw", 'the unit Mw is not known; did you mean "MW"?'),
+        *(('as(current, "mW")', "mW", ""), ('as(current, "nm")', "nm", ""), ('as(current, "S")', "S", "")),
+    ],
+)
+def test_unit_with_wrong_upper_or_lower_case_is_refused_with_the_right_unit(
+    expression: str, unit: str, hint: str
+) -> None:
+    if not hint:
+        assert value_of(expression, unit) is not None
+        return
+    with pytest.raises(ValueError, match=re.escape(hint)):
+        value_of(expression, unit)
+
+
+@table(
     ("expression", "unit", "value"),
     [
         ("current / (voltage * frequency)", "A/V/Hz", 4 / 400 / 50),

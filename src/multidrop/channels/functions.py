@@ -134,6 +134,24 @@ def _unit(text: str, name: str) -> ValueUnit:
     return ValueUnit(text, factor, tuple(sorted(exponents.items())))
 
 
+_OTHER_UNITS = frozenset({"nm", "kn"})  # nanometre and knot, which are no misspelled Nm and kN
+
+
+def misspelled_unit(text: str) -> str:
+    """Return a hint if a unit in this text has wrong upper or lower case, such as "KW" for "kW"; else ""."""
+    for part in re.split(r"[*·/]", text):
+        name = part.strip()
+        match = _POWER.fullmatch(name)
+        name = match[1] if match and name not in _KNOWN else name
+        if name in _KNOWN or name in _OTHER_UNITS or len(name) < 2:
+            continue
+        for known in KNOWN_UNITS:
+            is_prefix = {known[:1], name[0]} == {"m", "M"} and known[1:] in _KNOWN  # mW and MW are two units
+            if known.lower() == name.lower() and not is_prefix:
+                return f'the unit {name} is not known; did you mean "{known}"?'
+    return ""
+
+
 Value = float | None
 # units of the operands; None for a plain number, which fits every unit
 Units = Sequence[ValueUnit | None]

@@ -18,6 +18,7 @@ from multidrop.channels.functions import (
     StatefulFunction,
     Value,
     ValueUnit,
+    misspelled_unit,
     unit_of,
 )
 from multidrop.channels.grammar import (
@@ -188,12 +189,13 @@ class Program:
         """Return the factor that converts the expression's result to the channel's declared unit."""
         wanted = unit_of(unit)
         if result.unit is None:
+            _check_spelling(unit)
             return 1.0
         if not wanted.is_like(result.unit):
             if unit:
-                raise ExpressionError(
-                    1, f"the value is in {result.unit}, which cannot be converted to {unit}"
-                )
+                why = f"the value is in {result.unit}, which cannot be converted to {unit}"
+                hint = misspelled_unit(unit) or misspelled_unit(result.unit.text)
+                raise ExpressionError(1, f"{why}; {hint}" if hint else why)
             raise ExpressionError(1, f'the value is in {result.unit}; add unit = "{result.unit.text}"')
         return result.unit.factor / wanted.factor
 
@@ -254,11 +256,13 @@ class Program:
             del self._instructions[-len(points) :]
         curve = Curve([point.number for point in points if point.number is not None])
         self._instructions.append(_Applied(curve, 1, ()))
+        _check_spelling(operands[1].text)
         return unit_of(operands[1].text)
 
     def _as(self, operands: list[_Operand]) -> ValueUnit:
         if len(operands) != 2 or operands[1].text is None or operands[0].text is not None:
             raise ValueError('as() takes a value and a unit: as(x, "kW")')
+        _check_spelling(operands[1].text)
         return unit_of(operands[1].text)
 
     @property
@@ -311,6 +315,11 @@ def _applied(step: _Applied, operands: list[Value]) -> Value:
         operands = [None if value is None else value * factor for value, factor in pairs]
     result: Value = step.value(*operands)
     return result
+
+
+def _check_spelling(unit: str) -> None:
+    if hint := misspelled_unit(unit):
+        raise ValueError(hint)
 
 
 def _check_arity(call: CallStep, arities: range) -> None:
