@@ -246,7 +246,9 @@ _TABLES = {
 _BITS = (0x01, 0x02, 0x05, 0x0F)
 # limit of values per reply, even if the request asks for more
 _MOST = {NumberFormat.BIT: 2000, NumberFormat.U16: 125}
-_WRITES = {  # a request's function code: the declared write codes of the registers that it may write
+# Function code of a captured request, and the write codes of the registers to which it can belong. A register
+# that is declared for writes of one value may also be written as part of a block.
+_WRITES = {
     0x05: (0x05,),
     0x06: (0x06,),
     0x0F: (0x05, 0x0F),

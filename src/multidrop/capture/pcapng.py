@@ -118,7 +118,8 @@ _MASTER, _DRIVE = (bytes([10, 0, 0, 1]), 50000), (bytes([10, 0, 0, 2]), 502)
 _FAILED, _NOISE = (bytes([10, 0, 0, 2]), 1), (bytes([10, 0, 0, 3]), 2)
 _OUTBOUND = (_EPB_FLAGS, struct.pack("<I", 2))
 _INBOUND = (_EPB_FLAGS, struct.pack("<I", 1))
-_PACKETS = {  # for each side of the line: dissector, sender, receiver, packet options
+# how Wireshark shows bytes, by their origin: dissector, sender, receiver and packet options
+_PACKETS = {
     Side.EITHER: (_BYTES, None, _MASTER, [(_COMMENT, b"no frame")]),
     Side.ASKING: (_RTU, _MASTER, _DRIVE, [_OUTBOUND]),
     Side.ANSWERING: (_RTU, _DRIVE, _MASTER, [_INBOUND]),

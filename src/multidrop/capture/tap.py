@@ -133,7 +133,7 @@ class FlightRecorder:
             self._write(now)
 
     def close(self) -> None:
-        """Write a capture file if anomalies were recorded since the last file was written."""
+        """Write the anomalies that are in no file yet, if PAUSE_S has passed since the last file."""
         if self._anomalies and now_ns() >= self._next_ns:
             self._write(now_ns())
 

@@ -174,8 +174,9 @@ def _clocks() -> tuple[int, int]:
 class FollowedFleet:
     """The lines of a fleet, with those methods of a Poller that `multidrop serve` uses.
 
-    `path` is only for samples; `watch` reads the fleet's records. `on_change` is called in the event loop
-    when the fleet's lines have changed; the gateway then calls `adopt`.
+    The samples are read over the server connection `path`; `watch` reads the fleet's lines and masters.
+    `on_change` is called in the event loop when the fleet's lines have changed; the gateway then calls
+    `adopt`.
     """
 
     dropped = 0

@@ -165,8 +165,8 @@ class FleetGateway:
     async def _close(self) -> None:
         """Close everything, even if one part fails to close.
 
-        If the lines fail to close, this process could still send. Then the kernel's timer stays set, and the
-        lock is held until the process ends.
+        If the lines fail to close, this process could still send. Then the lock is held until the process
+        ends, and the kernel timer that kills this process at the end of its lease stays set.
         """
         with ExitStack() as last, ExitStack() as files:
             files.callback(self.log.close)

@@ -56,7 +56,7 @@ class FleetView:
         said = await asyncio.gather(*map(self._ask, present))
         self._says = dict(zip(present, said, strict=True))
         for state in filter(None, said):
-            with suppress(KeyError, TypeError, ValueError):  # the gateway's list of moved lines is invalid
+            with suppress(KeyError, TypeError, ValueError):  # raised if the list `last_moves` is invalid
                 self._records.moves.add(map(move_of, state.pop("last_moves")))
 
     async def _ask(self, gateway: str) -> dict[str, Any] | None:
@@ -150,7 +150,7 @@ class FleetWatch:
 
     @property
     def age_s(self) -> float | None:
-        """Return how old the newest view is; None if there is none yet."""
+        """Return the seconds since the fleet's state was last read; None if it was not read yet."""
         return None if self._looked is None else round(self._clock() - self._looked, 3)
 
     def lines(self) -> dict[str, Record]:

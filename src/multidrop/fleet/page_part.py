@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 EXAMPLE = "nats://127.0.0.1:4222"
 OLD_S = 5.0  # if the view of the fleet is older than this, the page reports a problem
-AGAIN_S = 1.0  # pause between attempts to connect as a commander
+AGAIN_S = 1.0  # pause between attempts to connect with the key for stops
 LOG = "fleet-commands.jsonl"
 WHOLE = "the fleet"  # key of the result for the whole fleet in the answer to a stop
 NO_COMMANDER = (
@@ -48,7 +48,7 @@ class FleetSettings:
     commander: str = ""
     samples: str = ""
     ca: str = ""
-    libraries: ClassVar[tuple[str, ...]] = ("nats",)  # packages that this part needs, imported in `build`
+    libraries: ClassVar[tuple[str, ...]] = ("nats",)  # required packages, which `build` imports
 
     def __post_init__(self) -> None:
         wrong = [
@@ -107,7 +107,7 @@ class FleetPart:
             await end_tasks(*tasks)
 
     async def _keep_commander(self, command: Callable[[], FleetCommands]) -> None:
-        """Keep a connection with the commander's key, so that a stop does not wait for a connection."""
+        """Keep a connection whose key allows stops, so that a stop is sent without a delay."""
         while True:
             try:
                 async with command() as self._commands:
@@ -162,7 +162,7 @@ class HasFolder(Protocol):
 
 
 def build(settings: FleetSettings, inside: HasFolder) -> FleetPart:
-    """Return the part; it connects to the servers when `run` is called.
+    """Return the part `fleet` of `multidrop serve`; it connects to the servers when `run` is called.
 
     Raises ImportError without the NATS client, OSError or ValueError for invalid files.
     """

@@ -177,7 +177,11 @@ class RowBuffer:
         self._columns = {name: bytearray() for name in _KINDS}
 
     def add(self, columns: BatchColumns) -> bool:
-        """Copy the rows. Return False if they number drives or registers in another way than earlier rows."""
+        """Copy the rows; return True if they were copied.
+
+        Rows have numbers instead of the names of drives, registers and statuses. Rows whose numbers stand for
+        other names than those of the earlier rows are not copied.
+        """
         names = {"drive": columns.drives, "register": columns.registers, "status": columns.statuses}
         if any(not _continues(names[of], known) for of, known in self._names.items()):
             return False
@@ -250,7 +254,7 @@ def unpack(data: bytes | memoryview) -> Any:
 
 
 def _table(data: bytes | memoryview) -> Any:
-    """Return the table in an Arrow stream. Raises ValueError if it is too large or has other column types."""
+    """Return the table in an Arrow stream. Raises ValueError if it is too large or a type is wrong."""
     size = unpacked_size(data)
     if size > MOST_UNPACKED:
         raise ValueError(f"the message has {size} bytes unpacked; the limit is {MOST_UNPACKED}")

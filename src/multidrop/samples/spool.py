@@ -39,7 +39,8 @@ _TEMPORARY = re.compile(r"\..+\.tmp")
 ENOUGH_ROWS = 1 << 14  # a message is written when this many rows wait in memory
 ENOUGH_S = 1.0  # a message is written when its oldest row has waited this long
 MOST_WAITING = 1_000_000  # limit of rows that wait in memory while the disk is slow or full: 38 MB
-MOST_UNDECIDED = 10_000  # limit of ranges in `_undecided`; even, because they are then joined in pairs
+# Limit of the ranges in `_undecided`. If there are more, ranges are joined in pairs, so the limit is even.
+MOST_UNDECIDED = 10_000
 AGAIN_S = 1.0  # pause after a disk error
 LOG_S = 60.0  # time between log lines about lost rows
 ENDING_S = 10.0  # time limit of `close` for writing to the disk
@@ -99,7 +100,7 @@ class SpoolFolder:
             return log
         found = _parsed(path)
         if found.get("format") != FORMAT or not re.fullmatch(r"[0-9a-f]{16}", str(found.get("log"))):
-            raise SpoolError(f"{path} is not a valid {HEAD} of this version ({FORMAT!r})")
+            raise SpoolError(f"{path} was damaged, or written by another version; expected {FORMAT!r}")
         if found.get("gateway") != wanted["gateway"]:
             raise SpoolError(
                 f"{self.path} is the spool of gateway {found.get('gateway')!r}, not of {wanted['gateway']!r}"
@@ -221,7 +222,8 @@ class Spool:
         self._taken = self._written = self._lost = 0
         self._acknowledged: int | None = None
         self._missing: Sequence[tuple[int, int]] = ()
-        # removed messages that the receiver may not have: `acknowledge` decides whether they are lost
+        # Messages that were removed before the receiver had confirmed them. `acknowledge` later finds out
+        # whether they were received or lost.
         self._undecided: list[RemovedMessages] = []
         self._trouble: str | None = None
         self._logged_s: float | None = None

@@ -83,14 +83,14 @@ Finding = Found | Crowd | Noise | Untried | Progress
 
 
 def candidate(family: type[Drive], settings: Settings, framing: Framing, address: int) -> Drive | None:
-    """Return a drive object of the family with these settings; None if its manual does not allow them.
+    """Return a drive object of the family; None if its manual excludes this framing, address or baud rate.
 
-    If the family does not allow the sweep's format, the drive object gets the family's usual format: a drive
-    also answers requests with another number of stop bits.
+    A format that the manual excludes is replaced by the family's usual format, because a drive also answers
+    requests that have another number of stop bits.
     """
     if not family.speaks(framing) or address not in family.addresses:
         return None
-    if framing is Framing.TCP:  # on Modbus TCP, only the gateway knows the drive's serial settings
+    if framing is Framing.TCP:  # the serial settings are set in the Modbus gateway, not here
         return family(address, framing=framing)
     if settings.baudrate not in family.baudrates:
         return None

@@ -41,8 +41,10 @@ R = TypeVar("R")
 Ask = Callable[[Drive, Message], Message]  # sends a request; raises BusError unless a valid reply comes
 
 MOST_READINGS = 3  # number of readings that a drive must answer if its family has no `identify` script
-NOISY = 1 / 3  # invalid bytes count as noise if more than this share of a sweep's addresses has them
-LEAST_NOISY = 4  # if fewer addresses than this have invalid bytes, the bytes never count as noise
+# Invalid bytes count as noise if they are received at more than a third of a sweep's addresses, and at least
+# at four addresses.
+NOISY = 1 / 3
+LEAST_NOISY = 4
 BEGUN = 2  # number of received characters after which a reply counts as started
 LATE = 8  # a late reply is matched to one of this many earlier requests
 MOST_TIMEOUT = 1.0  # limit of the timeout in s for an address at which a drive has answered
@@ -94,7 +96,8 @@ class _Scan:
 
     def _sweep(self, sweep: Sweep, left_after: float) -> Iterator[Finding]:
         addresses = [address for address in sweep.addresses if _key(sweep, address) not in self._found]
-        # Invalid replies by address: a description of a whole frame that does not match its request, or "".
+        # Addresses with invalid replies. The text describes a valid frame that answers another request; it is
+        # "" if no such frame was received.
         garbled: dict[int, str] = {}
         peers: dict[int, Peer] = {}
         for number, address in enumerate(addresses, 1):
@@ -182,9 +185,10 @@ class _Scan:
 
 
 def _key(sweep: Sweep, address: int) -> tuple[int, Framing, int]:
-    """Return the key of a drive, without the format: a drive may answer in several formats.
+    """Return what identifies a found drive: its address, framing and baud rate.
 
-    Over Modbus TCP, a drive also answers to every baud rate, because only the gateway uses it.
+    The format is left out, because a drive may answer in several formats. A drive behind a Modbus TCP gateway
+    has no baud rate here, because the scan cannot change it.
     """
     return address, sweep.framing, sweep.settings.baudrate if sweep.framing is not Framing.TCP else 0
 
@@ -206,7 +210,7 @@ def _late(sweep: Sweep, earlier: Sequence[int], completion: Completion) -> list[
 
 
 def is_whole(framing: Framing, received: bytes) -> bool:
-    """Return True if the received bytes are exactly one frame with a valid checksum."""
+    """Return True if the received bytes look like one whole frame. Only for RTU is the checksum checked."""
     if framing is Framing.RTU:
         return len(received) >= SHORTEST_REPLY and crc16(received, len(received)) == 0
     return framing is Framing.TCP or (received[:1] == b":" and received[-2:] == b"\r\n")

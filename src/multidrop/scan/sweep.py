@@ -75,7 +75,7 @@ def sweeps(
 ) -> list[Sweep]:
     """Return sweeps of all line settings in these families' documents.
 
-    The sweeps with the highest chance of finding a drive per second come first.
+    They are sorted by the probability of finding a drive, divided by the time of the sweep.
 
     Every setting is swept twice: first with a timeout for usual response delays, then with a timeout for the
     longest delays that the documents allow. `baudrates` and `formats` restrict the settings; empty means all.
@@ -102,7 +102,10 @@ def sweeps(
 
 
 def one_of_each_framing(planned: Sequence[Sweep]) -> list[Sweep]:
-    """Return two sweeps of each request, with a short and a long timeout, for a port of fixed format."""
+    """Return the sweeps for a port whose baud rate and format cannot be changed.
+
+    Each request of each framing is swept twice, with a short and with a long timeout.
+    """
     brisk: dict[tuple[Framing, ScanRequest], Sweep] = {}
     patient: dict[tuple[Framing, ScanRequest], Sweep] = {}
     for sweep in planned:
@@ -153,9 +156,10 @@ def _settings(families: Sequence[type[Drive]]) -> dict[Setting, dict[type[Drive]
 def _sweeps(
     setting: Setting, weights: dict[type[Drive], float], addresses: Sequence[int]
 ) -> Iterator[tuple[float, Sweep]]:
-    """Yield a few sweeps, with their likelihoods, that together find drives of every family at this setting.
+    """Yield sweeps, with their likelihoods, that together find drives of every family at this setting.
 
-    Each sweep reads the register that drives of the most remaining families answer.
+    There are as few sweeps as possible. Each one reads the register that exists in the most families for
+    which there is no sweep yet.
     """
     left = dict(weights)
     while left:

@@ -177,7 +177,7 @@ PROTOCOLS = {Framing.RTU: MODBUS, Framing.ASCII: MODBUS, Framing.TCP: MODBUS, Fr
 
 
 MOST_REMEMBERED = 10_000  # limit of a drive's recorded writes, to save memory
-# function codes of reads, by the function code of a write with the same length limit
+# writes whose length is limited like the length of a read, and the function code of that read
 _COUNTED_AS = {0x06: 0x03, 0x10: 0x03}
 # Longest silence within a frame, in s. Sources: the Modbus serial-line guide, 2.5.2.1; the third part of
 # Delixi's document; for TCP an assumed long time.
@@ -398,7 +398,7 @@ class SimulatedDrive:
         return raws
 
     def write(self, function: int, start: int, raws: list[int]) -> None:
-        """Write adjacent cells. If a cell rejects its count, raises Refusal and writes no cell."""
+        """Write raw numbers to adjacent addresses. Raises Refusal, and writes none, if one is rejected."""
         found = [self.memory.writable(function, start + at) for at in range(len(raws))]
         cells = [cell for cell in found if cell is not None]
         if len(cells) < len(raws):
@@ -428,7 +428,7 @@ class SimulatedDrive:
 
 
 def encoded(address: int, table: Table, register_address: int) -> int:
-    """Return the raw count of a register of an EncodedDrive; a coil has its lowest bit."""
+    """Return the number that an EncodedDrive has at this address; for a coil, take the lowest bit."""
     return (address * 257 + register_address * 31 + (table.read or table.write or 0)) & 0x7FFF
 
 
@@ -450,9 +450,9 @@ def _known(drive: Drive, register: Register[Any]) -> int:
 
 
 class EncodedDrive(SimulatedDrive):
-    """A drive whose raw counts depend on its address, the table and the register; see `encoded`.
+    """A drive for tests: each register has its own fixed number, from which a test can tell the register.
 
-    Writes are confirmed but change no count.
+    `encoded` computes the number. Writes are confirmed but change nothing.
     """
 
     def refresh(self, cell: MemoryCell) -> None:

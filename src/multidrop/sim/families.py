@@ -162,10 +162,11 @@ class SimulatedDelixiNative(MotorDrive):
     Replies to writes repeat the request, replies to queries have the value.
 
     While `locked` is set, writes of parameters are refused with FEH. A start during a fault is refused
-    with F0H. The manual does not say what happens to a run command if P00.00 is not 2; here it is
-    refused with F0H. Nor does the manual say how P00.01 affects K = 04; here the setpoint that was
-    written last is used. A fault number, also in the fault records, is sent as hex digits that equal its
-    printed decimal digits.
+    with F0H. The manual leaves two points open. It does not say what happens to a run command if P00.00 is
+    not 2: here it is refused with F0H. It does not say whether P00.01 selects between the setpoint in a
+    parameter and a setpoint written with function code 04: here the one that was written last is used.
+
+    Fault numbers are sent in binary-coded decimal: fault 10 is 10H.
     """
 
     initial_values = DELIXI_BY_LINE
@@ -185,7 +186,7 @@ class SimulatedDelixiNative(MotorDrive):
         return super().accept(cell, raw)
 
     def changed(self, cell: MemoryCell) -> None:
-        # the setpoint that was written last applies, so it becomes the run setpoint
+        # the motor runs with the setpoint that was written last
         if cell.name == "stored_frequency":
             self.memory.set(self.drive.register("frequency"), self["stored_frequency"])
         super().changed(cell)
@@ -236,7 +237,8 @@ class SimulatedERMAN(MotorDrive):
     """
 
     functions = (0x01, 0x03, 0x04, 0x05, 0x06, 0x08, 0x0F, 0x10)
-    # All examples in the manual reply 03 to an invalid address, but the table in section 5 has another code.
+    # In all examples of the manual, the reply to an invalid address has code 03. The table in section 5 has
+    # another code.
     codes = {
         Reason.FUNCTION: 1,
         Reason.READ_ADDRESS: 3,
@@ -298,7 +300,8 @@ IBD_BY_PARAMETER, IBD_BY_LINE, IBD_RUN_BY_LINE = 0, 5, 2
 IBD_STOP, IBD_RUN, IBD_JOG = 1, 2, 3  # values of bits 1 and 0 of the control word 2000H
 IBD_ALWAYS_SEEN = 1 << 11 | 1 << 12  # bits without a name that are 1 in the manual's example of PrA.22
 IBD_LARGEST = {107: 36000, 108: 36000}  # assumed largest values of Prb.07 and Prb.08; the manual states none
-# address of the output's function Prd.nn, and the output's bit in PrA.22
+# digital outputs: address of the parameter (Prd.nn) that sets the output's function, and bit mask of the
+# output in PrA.22
 IBD_OUTPUTS = {323: 1 << 8, 324: 1 << 9, 325: 1 << 10, 328: 1 << 13}
 # functions of the outputs, as set in Prd.23 to Prd.28
 IBD_RUNNING, IBD_FAULT, IBD_ACCELERATING, IBD_DECELERATING = 1, 3, 7, 8
@@ -352,7 +355,8 @@ class SimulatedIBD(MotorDrive):
     def _control(self, bits: int) -> None:
         """Carry out a control word.
 
-        BIT3 and BIT2, which are ambiguous in the manual, form one number here.
+        The manual is ambiguous about bits 3 and 2, the direction. Here they form one number: 1 is reverse,
+        2 is forward, 3 is a change of direction.
         """
         if bits & 0x10:
             self.motor.reset()

@@ -164,12 +164,12 @@ class Memory:
             cell.raw = int.from_bytes(data[size * at : size * (at + 1)]) & _MASKS[register.table.carrier]
 
     def get_text(self, text: Text) -> str:
-        """Return the characters in the registers of this text, up to the first NUL."""
+        """Return the characters in the registers of a text parameter, up to the first NUL."""
         cells = (self._cell(text.table, address) for address in self._addresses(text))
         return text.decode(b"".join(pack(cell.table, cell.raw) for cell in cells))
 
     def set_text(self, text: Text, value: str) -> None:
-        """Store characters in the registers of this text. Raises ValueError if they do not fit."""
+        """Store `value` in the registers of a text parameter. Raises ValueError if it does not fit."""
         data = text.encode(value)
         for at, address in enumerate(self._addresses(text)):
             self._cell(text.table, address).raw = int.from_bytes(data[2 * at : 2 * at + 2])
@@ -189,7 +189,7 @@ def _space(table: Table) -> object:
 
 
 def _is_better(register: Register[Any], known: Register[Any] | None) -> bool:
-    """Return True if `register` should replace the register `known` of a cell.
+    """Return True if `register` should replace `known`, a register at the same address.
 
     A writable register takes precedence, then a register that uses all bits of its words.
     """
@@ -223,5 +223,5 @@ def pack(table: Table, raw: int) -> bytes:
 
 
 def decode(register: Register[Any], raw: int) -> Any:
-    """Return the value of a register of one cell that has this raw count; None for "no value"."""
+    """Return the value of a one-word register whose raw number is `raw`; None for "no value"."""
     return register.value_in(pack(register.table, raw), 0)

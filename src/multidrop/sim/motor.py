@@ -230,7 +230,7 @@ MONITORS: Mapping[str, Callable[[Motor], float]] = {
     "last_fault": lambda motor: motor.fault_record(1),
 } | {f"fault_record_{nth}": lambda motor, nth=nth: motor.fault_record(nth) for nth in range(1, 5)}
 
-# functions that return the value of 100 %, by name of a register in percent
+# the motor's rated values, which are 100 % for registers in percent, by name of the register
 RATED: Mapping[str, Callable[[Rating], float]] = {
     "output_frequency": lambda rating: rating.frequency,
     "reference_frequency": lambda rating: rating.frequency,

@@ -44,10 +44,11 @@ from multidrop.sim.motor import COMMANDS, MotorDrive, Phase
 
 
 class ProfileDrive(MotorDrive):
-    """A simulated drive of a profile; its registers are named by their roles.
+    """A simulated drive of a family that shares its control and status words with other families.
 
-    While `is_local` is set, the keypad is in control and commands from the line are ignored. After a
-    `power_cycle` only settings in EEPROM are kept.
+    The names of its registers, such as "reference" and "control", are the same in all these families. While
+    `is_local` is set, the keypad is in control and commands from the line are ignored. After a `power_cycle`
+    only settings in EEPROM are kept.
     """
 
     is_local = False
@@ -344,7 +345,10 @@ class SimulatedInvt(ProfileDrive):
         return super().accept(cell, raw)
 
     def _canonical(self, raw: int) -> InvtControl | None:
-        """Return the profile's control word for a raw count. A family may have renumbered the words."""
+        """Return the control word whose name a raw number has in this family; None if it has no name.
+
+        Families use the same control words with different numbers.
+        """
         values: Any = self.drive.register("control").values
         return next((InvtControl[member.name] for member in values if member == raw), None)
 
@@ -424,8 +428,8 @@ class SimulatedYaskawa(ProfileDrive):
 class SimulatedOptidrive(ProfileDrive):
     """Optidrive E3: the motor runs while bit 0 is set and digital input 1 is on, even after a reset.
 
-    `is_enabled` is that input. With `is_first_reading`, register 6 is as in the first guide: the
-    fault code in the low byte, the state in the high byte.
+    `is_enabled` is that input. Two guides describe register 6 in different ways. With `is_first_reading`, the
+    first one applies: the fault code is in the low byte, the state in the high byte.
     """
 
     is_enabled = True

@@ -98,8 +98,8 @@ class Receiver:
     def _cut_rtu(self) -> Frame | None:
         """Return the next request; None if there is none yet.
 
-        Bytes that follow a request damage it, unless they start another request. They may be too few to
-        decide; then return None too.
+        Bytes that follow a request damage it, unless they start another request. Return None too if so few
+        bytes follow that they could still start one.
         """
         data = bytes(self._buffer[-MOST_RTU:])
         while (found := _first_request(data)) is not None:

@@ -58,7 +58,7 @@ class Simulator:
     @undisturbed
     def _start(self) -> None:
         with self._changing:
-            if not self._is_over:  # False if the thread has already ended
+            if not self._is_over:
                 self.open()
                 self._is_open = True
                 self._thread.start()

@@ -211,7 +211,7 @@ class Demo:
 
 @contextmanager
 def _drawn(stage: Stage) -> Iterator[None]:
-    """On a terminal, draw the fleet's state while the context lasts; afterwards, print the notes again."""
+    """Draw the fleet's state on a terminal; at the end, print the notes that the drawing has hidden."""
     if not sys.stdout.isatty():
         yield
         return

@@ -144,7 +144,7 @@ def picture(fleet: FleetState, size: tuple[int, int], head: str) -> list[TextLin
 
 
 def _body(fleet: FleetState, width: int, room: int) -> list[str]:
-    """Return the table of all gateways, then as many lines and recent changes of lines' gateways as fit."""
+    """Return three tables: all gateways, then as many lines and recent changes of masters as fit."""
     begin = [
         *gateway_table(fleet, width - 1),
         "",
@@ -362,7 +362,10 @@ def count_sentence(fleet: FleetState) -> str:
 
 
 def move_table(moves: Iterable[FleetState], width: float = inf) -> list[str]:
-    """Return a row of text for each move of a line: time, line, former master (if it fits), new master."""
+    """Return a row of text for each change of a line's master: time, line, former and new master.
+
+    If a row is longer than `width`, all rows leave out the former master.
+    """
     rows = [
         (
             moment(move["at_ms"]),

@@ -88,10 +88,10 @@ class CommandDesk:
     # ---- offering a command ----
 
     def offer(self, line: str, data: bytes) -> Offered | CommandAnswer | None:
-        """Check the command in a message, and return the offer to carry it out.
+        """Check the command in a message, and return this gateway's offer to carry it out.
 
-        If the command must not be sent, return an answer with the reason. Return None if another gateway is
-        the line's master.
+        The command is sent only after its sender has accepted the offer. If it must not be sent, return an
+        answer with the reason. Return None if another gateway is the line's master.
         """
         held = self._lines.for_command(line)
         if held is None:
@@ -201,7 +201,7 @@ class CommandDesk:
 def _prepared(held: HeldLine, request: CommandRequest) -> Prepared:
     drive = held.drive(request.drive)
     if request.verb == "stop":
-        raise ValueError("a stop needs no offer: send it to the line's own subject for stops")
+        raise ValueError("a stop needs no confirmation; send it to the line's subject for stops")
     kind = "write" if request.register else "verbs"
     if request.entry not in held.may[kind]:
         raise ValueError(
@@ -212,7 +212,7 @@ def _prepared(held: HeldLine, request: CommandRequest) -> Prepared:
 
 
 class StopDesk:
-    """Stops drives of this gateway's lines, and cancels commands that were offered for these drives."""
+    """Stops drives of this gateway's lines, and cancels the drives' commands that wait for confirmation."""
 
     def __init__(self, gateway: str, lines: HeldLines, offers: Offers, log: CommandLog) -> None:
         self.gateway = gateway
@@ -330,7 +330,7 @@ class CommandSubjects:
         self._stops = StopDesk(gateway, lines, self.desk.offers, log)
 
     async def begin(self) -> None:
-        """Subscribe to the subject on which senders confirm offered commands."""
+        """Subscribe to the subject on which users confirm the commands that this gateway has checked."""
         await self._subscribe(self.desk.subject, self.desk.do)
 
     def open(self, line: str, description: Any) -> None:

@@ -96,7 +96,10 @@ class FleetCommands:
     # ---- commands ----
 
     async def preview(self, request: CommandRequest) -> Offered | CommandAnswer:
-        """Return the gateway's offer or refusal for a command, without carrying it out."""
+        """Ask a gateway to check a command; return its offer to carry it out, or its refusal.
+
+        The command is not sent to the drive.
+        """
         return await self._offer(await self._line_of(request.drive), request)
 
     async def write(self, drive: str, register: str, value: float | str) -> CommandAnswer:
@@ -139,9 +142,9 @@ class FleetCommands:
         return answer
 
     async def _offer(self, line: str, request: CommandRequest) -> Offered | CommandAnswer:
-        """Request an offer over one server connection after another until one answers.
+        """Ask the line's gateway to check a command, over one server connection after another.
 
-        An unused offer has no effect.
+        The gateway then offers to carry it out. It does so only if the offer is accepted.
         """
         why = ""
         for path in self._paths:

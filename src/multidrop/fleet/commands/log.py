@@ -43,8 +43,9 @@ class CommandLog:
     async def note(self, record: Mapping[str, Any]) -> None:
         """Append a record with the time of day (UTC), and return once it is synced to the disk.
 
-        Raises OSError if that fails or takes longer than WRITING_S, if the log is closed, or if the system
-        cannot start a thread. A record that takes longer is written when the disk answers again.
+        Raises OSError if the writing fails, if the log is closed, if MOST_WAITING records wait already, or if
+        the system cannot start a thread. Raises OSError too if the writing takes longer than WRITING_S; the
+        record is then written as soon as the disk answers.
         """
         if self._waiting >= MOST_WAITING:
             raise OSError(f"{self.path}: {MOST_WAITING} records wait for the disk")

@@ -22,7 +22,7 @@ from multidrop.drive import verb_arguments, verbs_of
 from multidrop.fleet.commands.messages import CommandAnswer, CommandRequest
 from multidrop.fleet.lines.rules import SECOND
 
-LIMIT_NS = 1 * SECOND  # time limit from the offer until the command's first frame is sent
+LIMIT_NS = 1 * SECOND  # time limit from the check of a command until its first frame is sent
 REMEMBERED = 10_000  # limit of remembered offers; the oldest are forgotten
 LISTS = ("write", "verbs")  # the two lists in the plant file's table [fleet.may]
 _MOVING = ("start", "jog", "reset_fault", "set_frequency")
@@ -130,7 +130,7 @@ def prepare(drive: Drive, request: CommandRequest) -> Prepared:
 
 def _prepare_verb(drive: Drive, request: CommandRequest) -> Prepared:
     verb = request.verb
-    known = [one for one in verbs_of(drive) if one != "stop"]  # a stop is sent without an offer
+    known = [one for one in verbs_of(drive) if one != "stop"]  # stops are sent without a check
     if verb not in known:
         raise ValueError(f"{drive.name} has no verb {verb!r}; it has {', '.join(known) or 'none'}")
     arguments = verb_arguments(verb, request.options)
@@ -218,7 +218,7 @@ class Offers:
         return offer.made_ns + LIMIT_NS - self._clock()
 
     def why_late(self, offer: Offer) -> str:
-        """Return why it is too late to carry out an offer; "" if there is time."""
+        """Return why it is too late to send an offered command; "" if it may still be sent."""
         left = self.left_ns(offer)
         if left > 0:
             return ""
@@ -236,7 +236,7 @@ class Offers:
                 offer.why_void = offer.why_void or why
 
     def withdraw(self, offer: Offer, why: str) -> None:
-        """Cancel an offer, unless its command has started already."""
+        """Cancel a command that waits for confirmation, unless it has started already."""
         if self.take(offer):
             self.end(
                 offer, CommandAnswer(CommandOutcome.NOT_SENT, f"{offer.request.words} was not sent: {why}")

@@ -243,8 +243,8 @@ class Lease:
             return
         value = record.value
         if value and value["nonce"] == nonce and not value["ended"]:
-            # The record was written by this renewal or by an earlier one. The lease counts from the earlier
-            # one's time, which is safe in both cases.
+            # This renewal may be stored or not. So the lease still counts from `held.sent`, the time of the
+            # last confirmed renewal: it never becomes too long.
             self.held[path] = HeldRecord(record.revision, held.sent)
         elif record.revision > held.revision:
             self._lose(path)
@@ -259,9 +259,9 @@ class Lease:
     async def _take_late(self, path: int) -> None:
         """Write the lease record in a bucket that was not available when the session started.
 
-        The bucket may have a record of an earlier session. That record is replaced: the earlier session ended
-        when this session replaced its other two records. Nothing is written while this session has lost too
-        many records itself, because another process of the same name may use the record.
+        A record of an earlier session of this gateway is replaced. That session is over, because this session
+        has already replaced its other two records. If this session is over itself, write nothing: the record
+        may belong to another process of the same name.
         """
         nonce = self._nonce
         record = await self._read(path)

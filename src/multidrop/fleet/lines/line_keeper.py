@@ -59,7 +59,7 @@ class Lines(Protocol):
     async def take(self, line: str, description: Any) -> None:
         """Open the line and poll it.
 
-        If this raises, it must leave the line closed; the keeper calls it again later.
+        If this raises, it must leave the line closed; LineKeeper calls it again later.
         """
 
     async def let_go(self, line: str) -> None:
@@ -81,7 +81,7 @@ class PortLoss(NamedTuple):
 
 
 class TakenLine(NamedTuple):
-    """The revision of a polled line's plant record, and when polling started (CLOCK_BOOTTIME, ns)."""
+    """A polled line: revision of its stored description, and start of the polling (CLOCK_BOOTTIME, ns)."""
 
     revision: int
     since: int
@@ -242,7 +242,8 @@ class LineKeeper:
         self._on_change()
         failure = None if task.cancelled() else task.exception()
         if failure and not self._failure:
-            self._failure = failure  # the line may still be open; `fail` ends the process
+            # the line may still be open, so this process must end: `fail` raises the error
+            self._failure = failure
             self._has_failed.set()
 
     def _take_new(self, line: str) -> None:
@@ -321,9 +322,9 @@ class OwnerRecords:
         return self._lease.name, self._lease.session
 
     def is_mine(self, line: str) -> bool:
-        """Return True if ownership records with enough votes name this session.
+        """Return True if this session is the line's master: enough ownership records contain its name.
 
-        Records for which a release was sent are not counted.
+        A record is not counted after this gateway has sent a release that replaces it.
         """
         me, votes = self._me, 0
         for bucket, record in self._records.of(line).items():
@@ -332,7 +333,7 @@ class OwnerRecords:
         return votes >= NEEDED
 
     def doubted(self, line: str) -> set[str]:
-        """Return the NATS buckets in which this gateway may have released the line: no answer has come."""
+        """Return the NATS buckets that have not answered this gateway's release of the line."""
         return {
             bucket
             for bucket, record in self._records.of(line).items()
@@ -416,10 +417,10 @@ class OwnerRecords:
         return late
 
     async def give_away(self, lines: Sequence[str]) -> None:
-        """Release these lines: replace each record that names this session by a record that names no gateway.
+        """Release these lines: overwrite this session's ownership records with records without a gateway.
 
-        `is_mine` returns False for all these lines before the first write is sent, so a late answer to a
-        claim cannot make a line this gateway's own.
+        `is_mine` returns False for these lines before the first release is sent. So this gateway does not
+        poll a released line again if an earlier write of its ownership is confirmed late.
         """
         now_ms, nobody = time.time_ns() // 1_000_000, (NOBODY, 0)
         given: list[tuple[str, Record]] = []

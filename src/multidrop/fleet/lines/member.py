@@ -277,11 +277,11 @@ class Member:
             await asyncio.sleep(GUARD_LOOK_S)
 
     async def _watch_weakness(self) -> None:
-        """Give up this session after other gateways have ended one of its three lease records.
+        """Start a new session if other gateways have ended one of this session's three lease records.
 
-        A session with two records would end as soon as one more server fails. Giving it up leaves the lines
-        without a master for a moment. So only one gateway at a time gives up its session, when all servers
-        answer and lines can be claimed.
+        With two records, the session would be over as soon as one more server fails. Between two sessions
+        the gateway's lines have no master for a moment. So only one gateway of the fleet does this at a time,
+        and only while all three records could be written.
         """
         while True:
             await asyncio.sleep(WEAK_LOOK_S)
@@ -349,9 +349,10 @@ class Member:
     def _unopened(
         self, present: Mapping[str, Mapping[str, Any]], sharing: Iterable[str], lines: Iterable[str]
     ) -> tuple[tuple[str, frozenset[str]], ...]:
-        """Return the lines that each gateway has reported because it could not open them.
+        """Return, for each gateway, the lines whose ports it could not open.
 
-        A gateway whose lease record has no list of such lines is left out.
+        Gateways write these lines into their lease records, the records that they renew to stay alive. A
+        gateway whose record has no such list is left out.
         """
         unopened = {name: value.get("unopened") for name, value in present.items()}
         unopened[self.name] = list(self.keeper.unopened.named())

@@ -26,7 +26,8 @@ from multidrop.supervisor import end_tasks
 BELIEVING = lease_rules.USUAL._replace(lease=0, guard=0)
 
 LOOK_S = 0.1  # pause between two reads of a lease bucket; it delays a takeover by at most this time
-# how long to wait for answers when a session is ended; the next read shows the effect of later answers
+# How long to wait for the servers' answers when this process ends another session. If a server stores the
+# end later, the next read shows it.
 ENDING_S = 0.1
 
 _log = logging.getLogger("multidrop.fleet")
@@ -43,7 +44,7 @@ class Observer:
         self.paths = [Follower(bucket) for bucket in buckets]
         self.ended = 0  # number of sessions that this process ended
         self._watched: list[dict[str, SeenRevision]] = [{} for _ in buckets]
-        self._looked = [0] * len(self.paths)  # start of the newest read that was answered, by bucket (ns)
+        self._looked = [0] * len(self.paths)  # when the newest answered read of each bucket started (ns)
         # number of the newest session that is known to be over, by gateway
         self._over: dict[str, int] = {}
         self._clock = clock
@@ -58,9 +59,10 @@ class Observer:
             seen.update({name: one._replace(since=now) for name, one in seen.items()})
 
     async def look(self, path: int) -> bool:
-        """Read the changes in one lease bucket; return True if a session has ended, or may be ended now.
+        """Read the changes in one lease bucket; return True if a session has ended or has expired.
 
-        Raises FleetError if no server can be reached over this connection.
+        An expired session ends when a gateway marks its records as ended. Raises FleetError if no server can
+        be reached over this connection.
         """
         begun = self._clock()
         found = await self.paths[path].look()
@@ -149,7 +151,7 @@ class Observer:
         return not is_ended_by_another(record) or self._is_stale(path, record, now)
 
     def unseen_s(self, gateway: str) -> float:
-        """Return the time in s since this gateway was last seen to renew two of its lease records."""
+        """Return the age in s of the gateway's lease: the time since two of its records were seen renewed."""
         seen = [watched[gateway].since for watched in self._watched if gateway in watched]
         latest = sorted(seen, reverse=True)[: self.terms.needed]
         return (self._clock() - latest[-1]) / lease_rules.SECOND if latest else 0.0
@@ -157,11 +159,11 @@ class Observer:
     # ---- dead gateways ----
 
     def dead(self, present: Iterable[str] | None = None) -> dict[str, dict[int, Record]]:
-        """Return the gateways whose sessions may be ended, each with its stale lease records by bucket.
+        """Return the gateways whose sessions this process may end, each with its expired records by bucket.
 
-        A record counts as stale only if it was already stale at the start of the last answered read of its
-        bucket. While no reads are answered, this process does not see renewals of the record. `present` are
-        the names in `sessions`, if the caller already has them.
+        A record has expired if no renewal was seen for the duration of a lease. That time must have passed
+        before the newest answered read of its bucket was started, since renewals after it were not seen.
+        `present` are the names in `sessions`, if the caller already has them.
         """
         found = {}
         for name in self.sessions() if present is None else present:
@@ -202,7 +204,7 @@ class Observer:
         return self.ended > before
 
     def _remember_ended_sessions(self) -> None:
-        """Remember the sessions that are over, so that `restart_waits` does not make them alive again."""
+        """Remember the sessions that are over; `restart_waits` restarts the times that show this."""
         for name in {name for follower in self.paths for name in follower.records}:
             session = max((record.value["session"] for _, record in self._of(name)), default=0)
             if self.is_over(name, session):

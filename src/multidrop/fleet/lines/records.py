@@ -24,7 +24,8 @@ from multidrop.fleet.servers.connections import ServerPath
 
 _UNREAD: LineRecords = {}
 ASKED_AT_ONCE = 500  # limit of lines in one read request; servers allow 1024
-# how long the record of an unanswered write is read again: the write may still be stored after an election
+# How long to read a record again and again after a write without an answer. The servers may store the write
+# late, once they have elected a new leader.
 DOUBT_S = 30.0
 MOST_MOVES = 100  # number of remembered moves of lines between gateways
 MOST_REPORTED = 20  # limit of the moves in the state that a gateway reports
@@ -48,7 +49,7 @@ class FleetRecords:
         }
         self._of: dict[str, dict[str, Record | None]] = {}  # ownership records, by line and bucket
         self._owned: dict[Owner, set[str]] = {}  # lines with a record that names the session, by session
-        # master of a line, and number of the line's last move, by line
+        # each line's master, and how often the line has been claimed or released
         self._masters: dict[str, tuple[str, int]] = {}
         self.plant = Follower(Bucket(names.PLANT, path), self._note_plant)
         self._has_plant_changed = False
@@ -91,7 +92,7 @@ class FleetRecords:
             raise failure
 
     def works(self) -> list[Coroutine[Any, Any, None]]:
-        """Return one coroutine for each bucket, which reads it forever, so no bucket waits for another."""
+        """Return one endless reading coroutine per bucket, so that a slow bucket delays no other."""
         rests = {name: follower.rest for name, follower in {**self.owners, names.PLANT: self.plant}.items()}
         rests |= {name: partial(self.observer.rest, at) for at, name in enumerate(names.LEASES)}
         return [self._follow(name, rests[name]) for name in self._looks]
@@ -260,19 +261,22 @@ class Move(NamedTuple):
     """A change of a line's master. A gateway's name is "" if there is none, None if it is unknown."""
 
     line: str
-    turn: int  # number of the line's move, the same for all gateways
+    turn: int  # number of this change in the line's history, the same for all gateways
     at_ms: int  # UTC by the clock of the gateway that wrote the record; only for display
     before: str | None
     after: str
 
     def as_json(self) -> dict[str, Any]:
-        """Return this move as gateways send it and `--json` prints it."""
+        """Return this change as gateways send it and `--json` prints it."""
         line, turn, at_ms, before, after = self
         return {"line": line, "turn": turn, "at_ms": at_ms, "from": before, "to": after}
 
 
 def move_of(sent: Any) -> Move:
-    """Parse a move that another gateway sent. Raises KeyError, TypeError or ValueError for an invalid one."""
+    """Parse a change of a line's master as another gateway has sent it.
+
+    Raises KeyError, TypeError or ValueError if it is invalid.
+    """
     line, turn, at_ms, before, after = (sent[key] for key in ("line", "turn", "at_ms", "from", "to"))
     return Move(str(line), int(turn), int(at_ms), None if before is None else str(before), str(after))
 
@@ -285,7 +289,7 @@ class Moves:
         self._moves: dict[tuple[str, int], Move] = {}
 
     def add(self, moves: Iterable[Move]) -> None:
-        """Add moves. If two reports describe the same move, keep the more complete report."""
+        """Add changes of lines' masters. Of two reports of a change, keep the one with the former master."""
         for move in moves:
             key = (move.line, move.turn)
             known = self._moves.get(key)
@@ -296,10 +300,10 @@ class Moves:
             self._moves = {(move.line, move.turn): move for move in kept}
 
     def newest(self, number: int) -> list[Move]:
-        """Return at most this many moves of lines, newest first.
+        """Return at most this many changes of lines' masters, newest first.
 
-        A gateway that releases a line does not see which gateway claims it, and that gateway may not know
-        the previous master. The two gateways' reports are joined into one move.
+        If a gateway releases a line and another one claims it, each of them reports its own part. The two
+        reports are joined into one change with the former and the new master.
         """
         moves = dict(self._moves)
         for (line, turn), move in self._moves.items():

@@ -41,9 +41,9 @@ RULES = 2  # version of the rules of ownership below; increment it if those rule
 
 
 class Terms(NamedTuple):
-    """The times (ns) and numbers of records that a lease needs, the same for all gateways of a fleet."""
+    """The constants of leases, the same for all gateways of a fleet. Times are in ns."""
 
-    lease: int = 2_300_000_000
+    lease: int = 2_300_000_000  # duration of a lease after a renewal
     guard: int = 700_000_000  # time from the end of a session to the first request of the line's next master
     needed: int = 2  # number of lease records that the holder must renew
     ended: int = 2  # number of lease records that another gateway must end to take over
@@ -104,9 +104,9 @@ LineRecords = Mapping[str, Record | None]
 class Claim(NamedTuple):
     """The ownership records that a gateway must write to become the master of a line.
 
-    `first` and `spare` contain the buckets, each with the revision of the record to replace. The `spare`
-    records are written only if the write of a `first` record gets no answer. Each record that is written
-    gives the gateway `votes` votes.
+    `first` and `spare` are NATS buckets, each with the revision of the line's record to replace. The records
+    in `spare` are written only if a write in `first` gets no answer. Each written record counts as `votes`
+    votes for the gateway; a gateway with NEEDED votes is the master.
     """
 
     first: dict[str, int]
@@ -153,7 +153,10 @@ def owner_by(records: LineRecords) -> Record | None:
 
 
 def turn_of(records: LineRecords) -> int:
-    """Return the number of claims and releases of the line so far; 0 if it never had a master."""
+    """Return how often the line was claimed or released so far; 0 if it never had a master.
+
+    Each record contains this number, as it was when the record was written; the highest one is the present.
+    """
     turn = 0
     for record in records.values():
         if record and record.value and record.value["turn"] > turn:
@@ -176,7 +179,7 @@ def claim_of(
     """
     first_bucket, first = next(iter(records.items()), ("", None))
     if not first:
-        return None  # this record was not read yet; it may give another session two votes
+        return None  # this record was not read yet; with two votes in it, another session is the master
     if first.revision == NONE_YET:
         return Claim({first_bucket: NONE_YET}, {}, 1, NEEDED)
     free: dict[str, int] = {}
@@ -188,7 +191,7 @@ def claim_of(
         elif record and (owner == me or owner[0] == NOBODY or is_over(*owner)):
             free[bucket] = record.revision
         elif record and record.value["votes"] >= NEEDED:
-            return None  # another living session already has both votes
+            return None  # another living session is the master, with two votes in this record
     if not 0 < needed <= len(free):
         return None
     wanted = {bucket: free[bucket] for bucket in sorted(free, key=leaderless.__contains__)[:needed]}

@@ -26,17 +26,19 @@ import pyarrow.compute as pc
 from multidrop.fleet.lines.rules import SECOND
 
 BOUND = 110  # limit of a gateway's lines, in percent of the mean
-NUMBER_BITS = 16  # the low bits of a weight hold its gateway's number
+NUMBER_BITS = 16  # number of low bits of a line's hash that are replaced by a gateway's number
 # a gateway in its first seconds assigns lines only if no other gateway has come or gone for this time
 QUIET_NS = SECOND // 2
 OPENINGS = 3  # number of failed attempts to open a line after which the line is reported to other gateways
 # a line is reported to other gateways if its port is lost and no reply has come for this time
 LOST_NS = 6 * SECOND
-# LOST_NS counts from the newest reply, unless that reply is older than this when the loss is first noticed
+# LOST_NS counts from the newest reply. If that reply is already older than REPLY_NS when this gateway notices
+# the loss, LOST_NS counts from the notice.
 REPLY_NS = 3 * SECOND
 # first and longest wait before a gateway again tries to open a line that it has reported
 FIRST_WAIT_NS, LAST_WAIT_NS = 120 * SECOND, 24 * 3600 * SECOND
-# A trial of a line ends if the line is not assigned to this gateway within this time.
+# To find out whether it can open a reported line again, a gateway stops reporting the line. It gives up if
+# the line is not assigned to it within this time.
 TRIAL_NS = 60 * SECOND
 MOST_BYTES = 8_000  # limit, in bytes, of the names of reported lines in a lease record
 
@@ -196,7 +198,7 @@ class UnopenedLines:
         if line == self._tried:  # the network works again: try the other reported lines immediately
             self._tried, self._wait_ns, self._trial_at = "", FIRST_WAIT_NS, self._clock()
             for other in self._named.keys() - (self._named.keys() if self.home is None else self.home):
-                # a trial would fail: this line would be assigned to another gateway
+                # without a report, this line is assigned to another gateway, which then tries to open it
                 del self._named[other]
 
     def gone(self, line: str) -> None:
@@ -204,9 +206,10 @@ class UnopenedLines:
         self._lost_since.pop(line, None)
 
     def named(self) -> frozenset[str]:
-        """Return the reported lines, which other gateways should take.
+        """Return the lines that other gateways should take, because this gateway cannot open them.
 
-        Call this often: each call may withdraw the report of one line, as a trial.
+        Call this often. From time to time a call leaves out one line, so that the line is assigned to this
+        gateway, which then tries to open it again.
         """
         now = self._clock()
         if self._tried and now - self._tried_since >= TRIAL_NS:

@@ -54,7 +54,7 @@ BEHIND_S = 5.0  # how long to wait for a server that does not have the stream's 
 KEY = "multidrop"  # key in a Parquet file's metadata for multidrop's own entry, as in all recordings
 SECOND_NS = 1_000_000_000
 FORM = "%Y%m%dT%H%M%SZ"  # format of a time in a file's name
-# without Arrow's schema, `History` and DuckDB read columns of dictionaries as plain texts
+# If the file has no Arrow schema, `History` and DuckDB read dictionary-encoded columns as plain texts.
 WRITTEN = {"compression": "zstd", "compression_level": 1, "store_schema": False}
 OWN = {"rows", "tens", "damaged"}  # names of the folders in a hub's folder
 _NAME = re.compile(r"(\d{8,})-(\d{8,})\.(\d{8}T\d{6}Z)-(\d{8}T\d{6}Z)\.parquet")
@@ -66,19 +66,21 @@ _log = logging.getLogger("multidrop.fleet.samples.hub")
 
 
 class SourceCheck:
-    """Checks that no message of a gateway's log is missing or repeated.
+    """Checks that no message of a gateway is missing or repeated.
 
-    Alarms are logged as errors and counted, each once, even if messages are read again after a failure.
+    Each missing or repeated message is counted and logged as an error. It is counted once, even if the hub
+    reads messages again after a failure. A gateway numbers its messages; with a new spool folder it starts
+    again at 1, so the numbers are kept by gateway and id of the spool.
     """
 
     def __init__(self, last: Mapping[str, int]) -> None:
-        self.last = dict(last)  # sequence number of the last message, by gateway and id of its log
+        self.last = dict(last)  # sequence number of the last message, by gateway and id of the spool
         self.alarms = 0
         self.missing = 0  # number of missing messages
         self.doubled = 0  # number of repeated messages, which are ignored
-        # number of lost rows that the spool has reported, by gateway and id of its log
+        # number of lost rows that the gateway has reported, by gateway and id of the spool
         self._lost: dict[str, int] = {}
-        # sequence number of the last message counted as missing, by gateway and id of its log
+        # sequence number of the last message counted as missing, by gateway and id of the spool
         self._missed: dict[str, int] = {}
         self._newest = 0  # stream position of the newest message
         self._known = 0  # stream position up to which errors were counted before the last `restart`

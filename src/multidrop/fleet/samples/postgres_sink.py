@@ -30,7 +30,7 @@ MOVE = "update multidrop.hub set place = %s, sources = %s where stream = %s and 
 
 
 class PostgresSink:
-    """Writes each of the hub's commits in one database transaction.
+    """Writes the hub's samples to a PostgreSQL database, each call's rows in one transaction.
 
     `where` is a connection string, such as "dbname=plant".
     """
@@ -42,7 +42,7 @@ class PostgresSink:
         self._tables.close()
 
     def begin(self, stream: str) -> StoredPosition:
-        """Reconnect, create missing tables, and return the position in `multidrop.hub`."""
+        """Reconnect and create missing tables. Return the stream position up to which samples are stored."""
         with sentences():
             connection = self._tables.open()
             try:

@@ -314,7 +314,7 @@ class Forwarder:
         self._subject = subject_of(checked_name("gateway", spool.gateway), spool.log)
         self._news = asyncio.Event()
         self.sent = 0  # messages sent since the start
-        # sequence number of the spool's newest message in the stream; None: not known yet
+        # number of the newest message that was moved from the gateway's disk to the stream; None: unknown yet
         self.last: int | None = None
         self.trouble: str | None = None
 
@@ -376,7 +376,8 @@ class Forwarder:
     async def _ask(self) -> tuple[int, int]:
         """Return the stream position and the sequence number of the spool's last message in the stream."""
         last = await last_of(self._path, self._subject)
-        if last is None or last.sequence == 0:  # none is stored now, or the last message is forged
+        # if the stream has no message of this gateway now, or its last message is from another program
+        if last is None or last.sequence == 0:
             sequence = self.last or 0
             self._have(sequence)
             return (last.place if last else 0), sequence

@@ -40,7 +40,9 @@ SHAPES: Mapping[str, Mapping[str, Any]] = {
     names.PLANT: LINE,
 }
 MOST_TEXT = 300  # limit, in characters, of each text in a gateway's state
-SMALL, LARGE = 1 << 14, 1 << 20  # limits of a record's bytes; a line's record contains its family files
+# Limits of a record in bytes. The large one is for lines: a line's record contains the files that describe
+# its drive families.
+SMALL, LARGE = 1 << 14, 1 << 20
 _KINDS: Mapping[Any, str] = {
     **{int: "a whole number", float: "a number", str: "a text", bool: "true or false", dict: "a table"},
     **{int | None: "a whole number or null", float | None: "a number or null", str | None: "a text or null"},
@@ -269,7 +271,7 @@ class Follower:
         await asyncio.sleep(FOLLOW_S)
 
     def take(self, record: Record) -> bool:
-        """Store a record in the copy unless a newer record of its key was read before.
+        """Store a record in `records` unless a newer record of its key was read before.
 
         Return True if it was stored.
         """

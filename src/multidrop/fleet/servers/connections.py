@@ -59,8 +59,8 @@ MOST_SILENCE_S = 1.0  # limit of the wait before a repeat, because requests time
 # The usual response time is the longest recent one. Each answer multiplies it by this factor, so that one
 # slow answer is forgotten after about a hundred fast ones.
 FORGET = 0.97
-# Limit of the repeats that a process can save up for later. Until servers notice a dead route (after 3 s), a
-# process needs half as many.
+# Limit of the repeated reads that a process can save up for later. If a route between servers fails, they
+# notice it after 3 s. Until then a process needs half of these repeats.
 MOST_REPEATS = 300.0
 EARNED = 0.5  # each timely answer allows this many further repeats
 SEED = "SU"  # prefix of a user's secret key
@@ -229,7 +229,7 @@ class ServerPath:
             raise OutcomeUnknown(f"{self.url} gave no answer to {subject}: {failure}") from None
 
     async def collect(self, subject: str, data: bytes) -> list[DirectMessage]:
-        """Return the stored messages that answer a read request. Raises the errors of `request`.
+        """Return the stored messages that answer a read request. Raises the errors of the method `request`.
 
         If this connection is slow, the request is repeated on the other connections.
         """
@@ -237,7 +237,10 @@ class ServerPath:
         return await first_answer(paths, Request(subject, data), self.budget)
 
     async def gather(self, request: Request, get: DirectGet, silence_s: float = ANSWER_S) -> None:
-        """Collect the stored messages that answer a read request. Raises the errors of `request`."""
+        """Collect the stored messages that answer a read request.
+
+        Raises the errors of the method `request`.
+        """
         client, denials = self._connected(), self._denials
         before = denials.of_request(request.subject)
         try:
@@ -318,7 +321,7 @@ def _abort(client: BatchClient) -> None:
 
 
 def paths_of(urls: Sequence[str], options: Mapping[str, Any] | None = None) -> list[ServerPath]:
-    """Return three connections (paths). With three URLs, each has a different home server."""
+    """Return three connections (paths). With three URLs, each of them prefers a different server."""
     paths = [ServerPath([*urls[at % len(urls) :], *urls[: at % len(urls)]], options) for at in range(PATHS)]
     for path in paths:
         path.others, path.budget = [other for other in paths if other is not path], paths[0].budget
@@ -345,9 +348,9 @@ class RepeatBudget:
         self._took_s = MOST_SILENCE_S / SLOW  # usual response time; the first value is an assumption
 
     def note(self, *, is_late: bool) -> None:
-        """Update the budget after a read whose first request was answered.
+        """Earn or lose repeats, after the first request of a read was answered.
 
-        `is_late` means that the read was repeated before the answer came.
+        `is_late` means that the read had already been repeated when this answer came.
         """
         self._left = self._left / 2 if is_late else min(self._left + EARNED, MOST_REPEATS)
 

@@ -73,7 +73,7 @@ _INFO = "$JS.API.INFO"
 
 
 class TlsFiles(NamedTuple):
-    """Paths on a server: its certificate, its key, and the issuer's certificate for all servers."""
+    """Paths of a server's TLS files: its certificate, its key, and the CA certificate of all servers."""
 
     cert: Path
     key: Path
@@ -291,7 +291,7 @@ def account_of(user: str) -> str:
 
 
 def _request_subjects(mine: UserRights) -> list[str]:
-    """Return the subjects on which a user may send requests to gateways (not to the store)."""
+    """Return the subjects on which a user may send requests to gateways, without those to the servers."""
     return [subject for subject in mine.publish if not subject.startswith(_STORED)]
 
 
@@ -304,7 +304,7 @@ def _import(kind: str, account: str, subject: str) -> str:
 
 
 def _shared(some: Iterable[str], others: Iterable[str]) -> Iterator[str]:
-    """Yield each subject that matches an entry of both lists. In an entry, * matches one token."""
+    """Yield each subject that both lists allow. In a subject, * stands for any one token."""
     for one in some:
         for other in others:
             words = list(zip(one.split("."), other.split("."), strict=False))

@@ -26,12 +26,14 @@ from multidrop.supervisor import end_tasks
 # a server counts as silent after this time (in ns); followers contact their leader once a second
 SILENT_NS = 2_000_000_000
 SOON_S = 0.4  # time limit for a leader's answer, which usually takes some milliseconds
-HAND_OVER_S = 3.0  # pause between hand-overs of one bucket: shorter than the time between two elections
-# A server that is silent for longer than this is ignored: no bucket is handed over because of it, and no
-# release of a line waits for it.
+# Pause between two changes of a bucket's leader. It is shorter than the time between two elections that a
+# silent server starts.
+HAND_OVER_S = 3.0
+# A server that is silent for longer than this is ignored: no bucket changes its leader because of it, and
+# gateways hand over lines without waiting for it.
 SILENT_SERVER_S = 60.0
-RELEASE_LOOK_S = 0.05  # pause between checks of the servers' states while a line waits for its release
-HANDED_S = 1.0  # time limit of a hand-over; it takes 0.03 to 0.3 s
+RELEASE_LOOK_S = 0.05  # pause between checks of the servers' states while a line waits to be handed over
+HANDED_S = 1.0  # time limit for a change of a bucket's leader, which takes 0.03 to 0.3 s
 LEADER_LOOK_S = 0.02
 # Pause between checks by `keep_leaders`. Leaders report a silent server after 2 s, and the server starts its
 # first election after 4 s. So several checks find the silent server before that election.
@@ -52,9 +54,9 @@ class Replica(NamedTuple):
 
     @property
     def is_silent(self) -> bool:
-        """Return True if the leader has received no message from this server for 2 s, or never.
+        """Return True if the bucket's leader has received no message from this follower for 2 s, or never.
 
-        A server whose copy lags behind is not silent if the leader hears from it.
+        A follower whose copy of the bucket is old is not silent while its messages arrive.
         """
         return not self.is_current and not 0 < self.active_ns < SILENT_NS
 
@@ -157,7 +159,11 @@ async def hand_over(path: ServerPath, bucket: str, server: str) -> None:
 
 
 class LeaseTerms:
-    """Hands over the leadership of lease buckets to keep their Raft terms newer than a silent server's."""
+    """Changes the leaders of lease buckets regularly while a server is silent.
+
+    Each change starts a newer term of Raft, so that the silent server's term stays older. Otherwise the
+    buckets would lose their leaders when that server returns.
+    """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -212,7 +218,7 @@ async def _leads_now(path: ServerPath, bucket: str, server: str) -> bool:
 async def keep_leaders(
     path: Callable[[], ServerPath], is_ours: Callable[[], bool], clock: Callable[[], float] = time.monotonic
 ) -> None:
-    """Manage the buckets' leaders forever, while `is_ours()` returns True."""
+    """Manage the buckets' leaders whenever `is_ours()` returns True. Runs until it is cancelled."""
     terms = LeaseTerms(clock)
     while True:
         await asyncio.sleep(KEEP_S)
@@ -227,13 +233,14 @@ async def keep_leaders(
 
 
 class Releases:
-    """Decides which lines may be closed now so that another gateway can claim them immediately.
+    """Decides which lines this gateway may hand over to other gateways now.
 
-    A line is closed before it is released. It has no master until the release is stored and the other gateway
-    has claimed it. If too few buckets have a leader, a release cannot be stored, so this gateway continues to
-    poll the line. It also continues while a server is silent: when a server that was cut off returns, buckets
-    may lose their leaders for seconds, and during that time no gateway could claim the line. `on_change` is
-    called when the servers' state has changed.
+    A handed-over line is polled by no gateway until the servers have stored two changes of its records: the
+    release by this gateway and the claim by the next one. Both need buckets with a leader. So this gateway
+    keeps polling a line while too few buckets have a leader. It also does so while a server is silent,
+    because buckets may lose their leaders for seconds when that server returns.
+
+    `on_change` is called when the servers' state has changed.
     """
 
     def __init__(
@@ -246,16 +253,15 @@ class Releases:
         self._on_change = on_change
         self._clock = clock
         self._has_lines = False
-        # the buckets that have a leader, each with the time (s) since when one of its servers is silent, or
-        # with None if all its servers answer
+        # For each bucket with a leader: since when (s) one of its servers is silent; None if all answer.
         self._led: dict[str, float | None] = {}
 
     def due(self, lines: Set[str], wait_s: float = SILENT_SERVER_S) -> set[str]:
-        """Return the lines in `lines` that may be closed now; the other lines must wait.
+        """Return the lines in `lines` that may be handed over now; the other lines must wait.
 
-        A bucket is ready if it has a leader and no silent server. At least two buckets must be ready,
-        including the line's first bucket, whose record may have two votes. A server that is silent for longer
-        than `wait_s` seconds is ignored.
+        A bucket is ready if it has a leader and no silent server. A server that is silent for longer than
+        `wait_s` seconds is ignored. At least two buckets must be ready. One of them must be the line's first
+        bucket, since its record may be enough to make a gateway the master.
         """
         self._has_lines = bool(lines)
         waited_since = self._clock() - wait_s
@@ -270,7 +276,7 @@ class Releases:
             await asyncio.sleep(RELEASE_LOOK_S)
 
     async def look(self) -> None:
-        """Check the servers' states once if a line waits for its release."""
+        """Check the servers' states once, if this gateway has lines to hand over."""
         buckets = names.OWNERS if self._has_lines else ()
         found = await asyncio.gather(*(known_cluster(self._path(), bucket) for bucket in buckets))
         now, before, self._led = self._clock(), self._led, {}

@@ -50,7 +50,10 @@ def command_subject(line: str) -> str:
 
 
 def do_subject(gateway: str, run: str) -> str:
-    """Return the subject on which senders confirm commands that this process (`run`) has offered."""
+    """Return the subject on which users confirm commands that a gateway has checked.
+
+    `run` is a random id of the gateway's process.
+    """
     return f"do.{gateway}.{run}"
 
 

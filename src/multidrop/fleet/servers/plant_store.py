@@ -42,7 +42,7 @@ def read_plant(path: Path) -> tuple[Plant, dict[str, Any]]:
         if not line.port.startswith(SOCKETS):
             raise ValueError(
                 f"{path}: line {line.name} is at {line.port}: a fleet polls socket:// and tcp:// ports, "
-                "which every gateway can reach and close at once"
+                "which every gateway can reach, and can close without a delay"
             )
         try:
             check_channels(replace(plant, lines=(line,)))
