@@ -178,11 +178,11 @@ class Supervisor:
         self.keep(name, wait())
 
     async def within(self, name: str, limit_s: float, work: Callable[[], R], *, most: int = 4) -> R:
-        """Return the result of work, which is done in its own thread.
+        """Call `work` in its own thread, and return the result.
 
-        At most `most` calls with this name work concurrently; further calls wait. Raises Hung if the work
-        cannot start within `limit_s` seconds, or is not done `limit_s` seconds after its start. When work is
-        done, earlier work with the same name no longer counts as hanging, because the disk answers again.
+        At most `most` calls with this name run concurrently; further calls wait. Raises Hung if `work` cannot
+        start within `limit_s` seconds, or has not returned `limit_s` seconds after its start. Once a call
+        has returned, earlier calls with the same name no longer count as hanging.
         """
         begin_by = monotonic() + limit_s
         while len(going := [future for future, one in self._works.items() if one.name == name]) >= most:

@@ -218,9 +218,9 @@ class Commands:
         caller: Caller,
         admit: Admit = lambda what: inf,
     ) -> CommandResult:
-        """Carry out a verb once. The plant file must list every verb except "stop".
+        """Carry out a verb once. Every verb except "stop" must be listed in the plant file.
 
-        Callers over Modbus and tool ports are refused, because no person confirms their commands.
+        Modbus clients and vendors' PC tools are always refused here; their stops call `stop` directly.
         """
         if (unsupported := self._unsupported(verb)) is not None:
             return unsupported
@@ -306,7 +306,10 @@ class Commands:
         stops = self.stops[drive]
 
         def limit_ns() -> float:
-            """Return the deadline for sending the command (CLOCK_MONOTONIC, ns); 0 after a later stop."""
+            """Return the deadline for sending the command (CLOCK_MONOTONIC, ns).
+
+            The deadline is 0, so the command is not sent, if the drive was stopped after this call.
+            """
             return until_ns - boottime_ns() + monotonic_ns() if self.stops[drive] == stops else 0
 
         def why_not() -> CommandResult | None:
@@ -440,13 +443,13 @@ def _used(call: re.Match[str]) -> str:
 # ---- the commands of a gateway whose lines are polled by a fleet ----
 
 NOT_STARTED = "the stop was NOT sent: the fleet's part has not started; use the hard-wired stop"
-WHOLE = "the fleet"  # key of the result for the whole fleet in the answer to a stop
+WHOLE = "the fleet"  # key of the only result of FleetStops.stop
 
 
 class FleetStops(Commands):
     """Stops the drives of a fleet of gateways; refuses all other commands.
 
-    `part` returns the gateway's part `fleet`, which sends the stops, or None before that part has started.
+    `part` returns the sender of the stops: the gateway's part `fleet`, or None if it has not started.
     """
 
     def __init__(self, lines: PolledLines, may: May, part: Callable[[], Any]) -> None:

@@ -74,7 +74,7 @@ class NotifySettings:
         refuse(wrong)
 
     def check(self, plant: Plant) -> list[str]:
-        """Return an error sentence for each mistake in the file of targets, and for a missing library."""
+        """Return an error sentence for each mistake in the file of targets, and one if Apprise is missing."""
         path = input_file(self.targets, plant)
         try:
             targets, wrong = read_targets(path)
@@ -121,8 +121,8 @@ def _shown(url: str) -> str:
         host = user = None
     if not host or user is not None:
         raise ValueError(
-            "a webhook is https://HOST/PATH without a user; with a user, write an address of Apprise, "
-            "json://USER:PASSWORD@HOST/PATH"
+            "a webhook is https://HOST/PATH; if it needs a user's name and password, "
+            "it is json://USER:PASSWORD@HOST/PATH, which Apprise sends"
         )
     return f"{scheme}://{host}"
 

@@ -112,16 +112,20 @@ def missing_library(name: str, missing: ImportError) -> str:
 
 
 class Building(NamedTuple):
-    """A part that a thread is building or has built. Building may take long if a disk does not answer."""
+    """An optional part of the gateway, such as MQTT, that a thread is building or has built.
+
+    Building may take long if a disk does not answer.
+    """
 
     settings: Any
     part: asyncio.Future[Part]
 
 
 class LiveParts:
-    """The parts of the gateway that run, in `feeds` by the name of their table.
+    """The optional parts of the gateway, such as MQTT, from their start to their end.
 
-    If a part's files are on a disk that does not answer, the gateway starts without the part. The part is in
+    `feeds` has the running parts by name. A part's name is that of its table in `[serve]` of the plant file.
+    If a part's files are on a disk that does not answer, the gateway starts without the part, which is in
     `pending` until it is built.
     """
 
@@ -136,7 +140,10 @@ class LiveParts:
         self._replaced: dict[str, Any] = {}
 
     def source(self) -> Any:
-        """Return the attribute `source` of a part that is built but not started; None if none has it."""
+        """Return the source of values that replaces polling: `source` of a part that is not started yet.
+
+        Return None if no such part has it; then the gateway polls lines.
+        """
         built = [one.part.result() for one in self._built.values() if one.part.done()]
         sources = (getattr(part, "source", None) for part in built)
         return next((source for source in sources if source is not None), None)
@@ -171,9 +178,10 @@ class LiveParts:
     # ---- reload ----
 
     async def replace(self, wanted: Mapping[str, Any], plant: Plant) -> None:
-        """Close the parts with changed or removed tables, and build those with changed or new tables.
+        """Use the settings of a changed plant file; `wanted` has them by part.
 
-        If a new part cannot be opened, the previous parts are started again, and ValueError is raised.
+        Parts with unchanged settings continue. The others are closed, and built again if they are in
+        `wanted`. If one cannot be opened, start the previous parts again, and raise ValueError.
         """
         self._replaced = {name: one for name, one in self._settings.items() if wanted.get(name) != one}
         await self._drop([*self._replaced], END_S)
@@ -185,7 +193,7 @@ class LiveParts:
             raise
 
     async def take_back(self) -> None:
-        """Close the new parts, and start the previous ones again."""
+        """Undo `replace`: close the parts that it built, and start again those that it closed."""
         replaced = self._replaced
         await self._discard()
         for name, settings in replaced.items():
@@ -217,9 +225,9 @@ class LiveParts:
                 raise failure
 
     async def _discard(self) -> None:
-        """Close the parts that were not started.
+        """Close the parts of the gateway that `take_up` has not started.
 
-        Those that are still being built are closed when they are built.
+        A part that a thread is still building is closed when it is built.
         """
         built, self._built = self._built, {}
         await _close_when_built(built)

@@ -133,7 +133,7 @@ class Reload:
         is_followed = not isinstance(poller, Poller)
         if is_followed and (plant.lines or settings.parts.get("fleet") != gateway.settings.parts["fleet"]):
             raise ValueError(f"a change of [serve.fleet] or [[line]] {RESTART}")
-        if gateway.audit:  # check it before `poller.adopt` opens it
+        if gateway.audit:  # refuse the reload if the audit log, which `poller.adopt` opens, is not writable
             await supervisor().within("audit log", AUDIT_S, partial(check_writable, gateway.audit))
         await gateway.parts.replace(settings.parts, plant)
         gateway.hand_out(poller)
@@ -180,9 +180,9 @@ class Reload:
         gateway.guarded("frames", gateway.frames.note_news)
 
     def without_changed_drives(self, batch: Batch) -> Batch:
-        """Return the batch without values of drives that the reload in progress changes.
+        """Return the batch without the drives that the plant file changes, while a reload is in progress.
 
-        It is unknown whether such a value was polled under the old plant or under the new one.
+        It is unknown whether their values were polled with the old settings or with the new ones.
         """
         columns = batch.columns() if self._changed else None
         if columns is None or self._changed.isdisjoint(columns.drives):

@@ -134,7 +134,7 @@ class Folders:
 
 
 def input_file(name: str, plant: Plant) -> Path:
-    """Return the path of a plant's input file, with the folders in this process's environment."""
+    """Return the path of an input file: in systemd's credentials folder, or beside the plant file."""
     return Folders(plant.path, os.environ).find(name)
 
 
@@ -166,7 +166,7 @@ def refuse(mistakes: Iterable[str]) -> None:
 
 
 def parsing_mistakes(settings: object, **parsers: Callable[[str], object]) -> Iterator[str]:
-    """Yield an error sentence for each setting whose text its parser refuses with ValueError."""
+    """Parse each setting with its parser, and yield an error sentence for each ValueError."""
     for key, parse in parsers.items():
         try:
             parse(getattr(settings, key))
@@ -333,7 +333,10 @@ def _may(table: Any, look: str, plant: Plant, place: TomlPlace) -> May:
 
 
 def _part(name: str, table: Mapping[str, Any], plant: Plant, place: TomlPlace) -> Any:
-    """Return the settings in a part's table, checked by the part's dataclass; None if there are mistakes."""
+    """Return the settings of an optional part of the gateway, such as MQTT; None if there are mistakes.
+
+    `table` is the part's table in the plant file. The part's own dataclass checks it.
+    """
     try:
         made, keys = _settings_of(name)
     except ImportError as missing:

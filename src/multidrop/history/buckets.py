@@ -14,7 +14,8 @@ MOST_POINTS = 100_000
 _BEFORE_ALL, _AFTER_ALL = -(1 << 64), 1 << 64  # in ns: before and after the time of every row
 # an empty bucket: number of values, number of failed reads; sum, least and greatest of the values
 _EMPTY = 0, 0, 0.0, math.inf, -math.inf
-# Shorter buckets are computed from rows, longer ones from ten-second summaries at a hundredth of the cost.
+# Buckets of this length or more are rounded up to 10 s or more, and computed from the stored summaries of ten
+# seconds. This costs a hundredth of computing them from rows, which shorter buckets need.
 FINE_NS = 2 * SECOND_NS
 
 

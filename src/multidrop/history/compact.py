@@ -62,10 +62,11 @@ def main(words: list[str] | None = None) -> int:
 
 
 def compact(folder: Path, below: int, *, merge_rows: bool = False) -> None:
-    """Convert the segments below this number to Parquet, and merge the summaries of past hours and days.
+    """Convert the segment files with numbers less than `below` to Parquet, and merge files of summaries.
 
-    A summary is ten seconds of a register. With `merge_rows`, also merge the rows of each past hour, and
-    compute missing summaries for files in `rows/`.
+    A summary has the least, mean and greatest value of a register in ten seconds. The summaries of each past
+    hour are merged into one file, and then those of each past day. With `merge_rows`, also merge the rows of
+    each past hour, and compute missing summaries of files in `rows/`.
     """
     for name in ("rows", "tens", "damaged"):
         (folder / name).mkdir(exist_ok=True)
@@ -83,7 +84,8 @@ def compact(folder: Path, below: int, *, merge_rows: bool = False) -> None:
             print(f"{len(damage) - MOST_REPORTED} more damaged segments are not listed", file=sys.stderr)
         if merge_rows:
             rows = widest(parquet_files(folder / "rows"))
-            # before the merge, because a merged file does not show which of its parts lack summaries
+            # Compute missing summaries before rows are merged: a merged file does not show which of the files
+            # in it had no summaries.
             _make_tens(database, folder, rows[:-1])
             for part in (part for run in finished(rows, 3600, set()) for part in _parts(run)):
                 _merge(database, part, MERGED_ROWS, keeps_metadata=True)

@@ -90,7 +90,8 @@ def listing(folder: Path) -> Listing:
     """
     if folder.suffix == ".arrows":
         return Listing(dict(segments_of(folder)))
-    # the folder is listed before `rows/` and `tens/`: see rule 3 in the package's docstring
+    # Keep this order of listing: the segments, then `rows/`, then `tens/`. Rule 3 of the package's docstring
+    # needs it.
     segments = dict(segments_of(folder / STEM))
     rows = {file.first: file for file in widest(parquet_files(folder / "rows"))}
     tens = widest(parquet_files(folder / "tens"))

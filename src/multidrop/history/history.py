@@ -97,10 +97,11 @@ class History:
     ) -> HistoryRows:
         """Return the rows of the series (None: all series) with begin <= time < end (None: no limit).
 
-        The rows come in the order of recording. If a register had another unit, or other names of its values,
-        in a part of the range, the rows from that part are in a separate column, such as "motor_load [A]".
-        `metadata` describes both columns. The result is a recording like `multidrop.open_recording` gives:
-        `to_pandas()`, `to_polars()`, `wide()`, batches of rows, Arrow.
+        The rows come in the order of recording. The unit of a register, or the names of its values, may have
+        changed within the range. Rows from before such a change then have another register name, such as
+        "motor_load [A]", so they are a separate column in wide tables. `metadata` describes both names. The
+        result is a recording like that of `multidrop.open_recording`: `to_pandas()`, `to_polars()`, `wide()`,
+        batches of rows, Arrow.
         """
         first = ALWAYS[0] if begin is None else ns_of(begin)
         return HistoryRows(self, parsed_series(series), first, ALWAYS[1] if end is None else ns_of(end))
@@ -173,12 +174,11 @@ class History:
     ) -> dict[str, Buckets]:
         """Return each series' least, mean and greatest values in at most `points` buckets of the range.
 
-        `end` None means now. Each bucket keeps its extreme values in `most` and `least`. Buckets of 2 s and
-        more are rounded up to whole tens of seconds, minutes, hours or days of UTC. So the first bucket
-        may start before `begin`, and the last bucket may end after `end`.
+        `end` None means now. Buckets of 2 s and more are rounded up to whole tens of seconds, minutes, hours
+        or days of UTC. So the first bucket may start before `begin`, and the last bucket may end after `end`.
 
-        If a register had another unit, or other names of its values, in a part of the range, only values in
-        the newest unit are included: see `unit` and `left_out`.
+        If a register's unit, or the names of its values, changed within the range, only values with the
+        newest unit are included. In the `Buckets`, `unit` is this unit, and `left_out` has the other units.
         """
         names = parsed_series(series)
         if not names:
@@ -227,7 +227,7 @@ class History:
         begin: Moment | None = None,
         end: Moment | None = None,
     ) -> Iterator[bytes]:
-        """Yield the rows that `read` returns as pieces of a .csv file with a column `unit`."""
+        """Yield a .csv file, piece by piece. It has the rows that `read` returns, and a column `unit`."""
         rows = self.read(series, begin, end)
         units = unit_texts_of(rows.metadata)
         lines = (lines_with_units(batch, units) for batch in rows)

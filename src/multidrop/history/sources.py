@@ -115,9 +115,9 @@ class Sources:
         return segment
 
     def known(self, found: Listing, begin: int, end: int) -> dict[int, FileUnits]:
-        """Return the units in each segment that may have rows in this range.
+        """Return the units of the registers in each file that may have rows in this range of time.
 
-        Raises Replaced if a file no longer exists.
+        The key is the file's number. Raises Replaced if a file no longer exists.
         """
         files = {number: file for number, file in found.rows.items() if file.may_have(begin, end)}
         unread = [file for number, file in files.items() if number not in self._known]
@@ -272,10 +272,11 @@ def write_parquet(
     metadata: Metadata,
     others: Mapping[int, Iterable[OtherColumn]],
 ) -> int:
-    """Write these batches, and the rows of these series and this range in `files`, to a Parquet file.
+    """Write a Parquet file, and return its number of rows.
 
-    `others` are the columns for values in earlier units, by the number of a file's first segment. Return the
-    number of rows. Raises Replaced if a file no longer exists.
+    It gets all rows of `batches`, and those rows of `files` that are in `series` and `range_ns`. `others` has
+    other names of registers, for their values in earlier units; the key is the number of a file's first
+    segment. Raises Replaced if a file no longer exists.
     """
     condition, values = _condition(series)
     values |= dict(zip(("begin", "end"), range_ns, strict=True))
@@ -292,7 +293,7 @@ def write_parquet(
 
 
 def _columns(others: Iterable[OtherColumn]) -> str:
-    """Return SQL to append to `select *`, which renames registers to these columns."""
+    """Return an SQL clause that gives registers other names in the result of a query `select *`."""
     whens = " ".join(
         f"when drive = {quoted(drive)} and register = {quoted(register)}"
         f"{'' if unit is None else f' and unit = {quoted(unit)}'} then {quoted(name)}"

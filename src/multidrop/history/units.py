@@ -66,7 +66,7 @@ def _unit_in(about: Mapping[str, Any]) -> SeriesUnit:
 
 
 def description_of(unit: SeriesUnit) -> dict[str, Any]:
-    """Return a register's metadata if its values have this unit."""
+    """Return metadata that describe a register with this unit, such as {"unit": "A"}."""
     if unit.text == RAW:
         return {"unit": "", "step": None}
     if unit.text == NAMED:
@@ -82,10 +82,13 @@ def _number(text: object) -> object:
 
 
 class OtherColumn(NamedTuple):
-    """The column in which one file's values of a series in an earlier unit are returned."""
+    """The register name for a series' values in an earlier unit, such as "load [A]" for "load".
+
+    It applies to one file of the history.
+    """
 
     series: Series
-    unit: str | None  # the earlier unit; None: all of the file's values of the series have it
+    unit: str | None  # unit of the values; None: all values of the series in the file get the name
     column: str
 
 
@@ -140,7 +143,7 @@ class UnitHistory:
         ]
 
     def described(self, metadata: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the metadata with the unit of every column, including the columns of earlier units."""
+        """Return the metadata with the units of all registers, also of those such as "load [A]"."""
         columns = {series: (series[1], unit) for series, unit in self.newest.items()}
         drives = {name: dict(_table(about)) for name, about in _table(metadata.get("drives")).items()}
         said = units_by_series(metadata)
@@ -158,11 +161,11 @@ class UnitHistory:
         return self.newest[series].text if series in self.newest else None
 
     def series_of(self, number: int) -> tuple[Series, ...]:
-        """Return the series whose values in this segment are all in their newest unit."""
+        """Return the series that have no values in an earlier unit in this segment."""
         return tuple(one for one in self._series or () if self._is_newest(one, number))
 
     def is_whole(self, first: int, last: int) -> bool:
-        """Return True if all values of the segments `first` to `last` are in their series' newest unit."""
+        """Return True if the segments `first` to `last` have no values in an earlier unit of their series."""
         return not self.left_out or all(
             self._is_newest(one, number) for one in self.left_out for number in range(first, last + 1)
         )

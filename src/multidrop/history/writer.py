@@ -206,7 +206,10 @@ class Compactor:
         self.is_possible = importlib.util.find_spec("duckdb") is not None
 
     def tend(self, below: int) -> None:
-        """Collect a finished child. Start a child if segments below number `below` are not compacted yet."""
+        """Start the compaction of the segments with numbers less than `below`, in a child process.
+
+        Do nothing while the previous process runs. If it has ended, log its errors.
+        """
         if self._child and self._child.poll() is not None:
             self._note(self._child)
             self._child = None

@@ -241,7 +241,7 @@ class BatchDecoder:
         return valid, *data
 
     def _learn(self, header: FlatTable, body: memoryview) -> None:
-        """Store the dictionary in this message; a delta extends the stored dictionary."""
+        """Remember the names in this dictionary message. If it is a delta, add them to the known names."""
         number, table = header.number(0, "<q"), header.table(1)
         if table is None or number not in self._ids:
             raise ValueError("it has a dictionary that no column uses")

@@ -169,7 +169,10 @@ class _BatchCodes:
         self.certain = self.valid = columns.valid
 
     def codes(self, begin: int, end: int) -> Codes | None:
-        """Return the rows' codes with the names that they stand for; None if there are too many names."""
+        """Return the codes of the rows' drives, registers and statuses, each with the names for the codes.
+
+        Return None if the rows have more names than a column has codes.
+        """
         columns, rows = self._columns, slice(begin, end)
         statuses = self._statuses.narrow(columns.status[rows])
         if statuses is None:
@@ -197,7 +200,10 @@ class _RowCodes:
         self.certain, self.valid = (_bits(children[number]) for number in (2, 5))
 
     def codes(self, begin: int, end: int) -> Codes | None:
-        """Return the rows' codes with the names that they stand for; None if there are too many names."""
+        """Return the codes of the rows' drives, registers and statuses, each with the names for the codes.
+
+        Return None if the rows have more names than a column has codes.
+        """
         found: Codes = {}
         for number, texts in self._texts.items():
             known, part = self._known[number], texts[begin:end]
@@ -239,7 +245,10 @@ def _zeros(bits: bytes, rows: int) -> int:
 
 
 def _record_batch(rows: int, nulls: Sequence[int], buffers: Sequence[Any]) -> tuple[Table, list[Any]]:
-    """Return the table of a batch, and its buffers, each padded to a multiple of eight bytes."""
+    """Return the two parts of an Arrow record batch: its header, and its buffers with padding.
+
+    Each buffer is padded to a multiple of eight bytes.
+    """
     nodes = [number for count in nulls for number in (rows, count)]
     places: list[int] = []
     body: list[Any] = []

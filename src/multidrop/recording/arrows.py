@@ -63,7 +63,8 @@ class ArrowsReader(RecordingReader):
             for message in messages(file, size):
                 if not self._whole:
                     self.metadata = self._read_schema(message)
-                # other libraries fail on a last dictionary without its batch, so it counts as truncated
+                # Count a dictionary at the end of the file, without its batch, as truncated. Other libraries
+                # cannot read such a file.
                 elif message.kind == DICTIONARY_BATCH:
                     continue
                 self._whole = message.end
@@ -181,7 +182,8 @@ class ArrowsTail:
                 return
             body = self._body(message)
             try:
-                # `_end` moves only past a whole batch: a failed write removes the batch and its dictionaries
+                # Read a dictionary again in the next call until its batch is complete: if the writer cannot
+                # write the batch, it removes both from the file.
                 if message.kind != RECORD_BATCH:
                     self._decoder.decode(message, message.header, body)
                     continue
@@ -201,7 +203,8 @@ class ArrowsTail:
         length, place = message.end - message.body, message.body
         if sys.platform != "win32":
             return memoryview(os.pread(self._file.fileno(), length, place))
-        with self.path.open("rb") as file:  # Windows lacks pread, but cannot remove an open file
+        # Windows has no pread. The path still leads to the same file: Windows does not remove an open file.
+        with self.path.open("rb") as file:
             file.seek(place)
             return memoryview(file.read(length))
 

@@ -20,7 +20,7 @@ from multidrop.recording.arrows import ArrowsReader, ArrowsWriter
 from multidrop.recording.format import Metadata, RecordingWriter, writing
 from multidrop.transport import clock
 
-MOST_CUT = 1 << 24  # a longer incomplete batch, in bytes, is not removed from a file's end
+MOST_CUT = 1 << 24  # length, in bytes, of the longest incomplete batch that is removed from a file's end
 
 
 def segments_of(path: Path, suffix: str = ".arrows") -> list[tuple[int, Path]]:
@@ -177,7 +177,8 @@ def outlived(
 def _ages(files: Iterable[StoredFile], now: float, longest: float) -> dict[int, float]:
     """Return each file's age in s, by file number.
 
-    Time between two successive files does not count if it is longer than `longest` s.
+    A file's age is the sum of the times from its end to the end of the next file, and so on until now. The
+    sum leaves out times longer than `longest` s: a pause in recording, or a change of the clock.
     """
     ends: dict[int, float] = {}
     for file in files:

@@ -62,7 +62,7 @@ def numbers_of(column: Any) -> Array:
 def rows_by_series(drive: Array, register: Array, time: Array) -> list[Array]:
     """Return the row indexes of each series (a drive's register), in the order of time.
 
-    `drive` and `register` are the codes of at least one row.
+    `drive` and `register` are codes. There must be at least one row.
     """
     pair = drive.astype(np.int64) * (int(register.max()) + 1) + register
     order = np.lexsort((time, pair))
@@ -159,7 +159,7 @@ class SeriesWriter(RecordingWriter):
         self._waiting_rows = 0
         self._trigger = trigger_of(metadata)
         self._is_closed = False
-        self.begin_ns: int | None = None  # time of the earliest row in the first piece, ns UTC
+        self.begin_ns: int | None = None  # time of the earliest row of those that were written first, ns UTC
 
     @property
     def statuses(self) -> list[str]:
@@ -187,7 +187,7 @@ class SeriesWriter(RecordingWriter):
         self._thread.submit(work).result()
 
     def _open(self, work: Callable[[], Any]) -> None:
-        """Create the file by this work in the library's thread; remove the file if that fails."""
+        """Call `work`, which creates the file, in the library's thread. If it fails, remove the file."""
         try:
             self._in_thread(work)
         except BaseException:

@@ -146,7 +146,7 @@ class TriggeredWriter(RecordingWriter):
             self.newest = recording.writer.path
 
     def close(self) -> None:
-        """Close the recordings in progress, even before `post` seconds after their trigger."""
+        """Close the recordings in progress, even if `post` seconds have not passed since their trigger."""
         with ExitStack() as stack:  # the stack closes all recordings, even if closing one of them fails
             while self._open:
                 stack.callback(self._open.pop().writer.close)

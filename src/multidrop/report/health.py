@@ -69,7 +69,7 @@ def delays(recording: Recording) -> list[DelaySeries]:
 
 
 def _spans_loss(series: Series) -> Array:
-    """Mark values whose reply may belong to another request, which was lost during the same exchange."""
+    """Mark values with a lost request between their request and their reply, which may be to the lost one."""
     asked = [number for number, status in enumerate(series.statuses) if not status.startswith(UNASKED)]
     lost = np.unique(series.time[series.missed & np.isin(series.status, asked)])
     next_lost = np.append(lost, np.iinfo(np.int64).max)[np.searchsorted(lost, series.time)]
@@ -272,7 +272,7 @@ def _line_use(recording: Recording, line: str, planned: Mapping[str, Any]) -> Li
     time, needed, silence = (np.concatenate(column) for column in zip(*parts, strict=True))
     order = np.argsort(time, kind="stable")
     time, needed, silence = time[order], needed[order], silence[order]
-    if len(time):  # of two successive exchanges, the one that needs the longer silence determines it
+    if len(time):  # the silence between two exchanges is the longer one of those that their drives need
         needed = needed + np.maximum(silence, np.concatenate([silence[1:], silence[-1:]]))
         # Some ports, such as network ports, are faster than their baud rate: limit the needed time to the
         # measured time.
@@ -310,7 +310,7 @@ def _exchanges(recording: Recording, name: str, drive: Mapping[str, Any]) -> tup
     requests = [Message(1, asked, at, count, bytes(4)) for asked, at, count in blocks.T.tolist()]
     replies = [characters_on_wire(framing, reply_length(framing, request)) for request in requests]
     characters = np.array(replies)[which]
-    # Rows have only the times of the request's start and of the reply's first character, so add the rest.
+    # A row's uncertainty lasts until the reply's first character, so add the time of its other characters.
     rest = (characters - 1) * drive["character_ms"] / 1e3
     return time, uncertainty / 1e9 + rest, len(times)
 

@@ -32,7 +32,8 @@ from multidrop.recording.series import (
 
 NUMBERS = ("time", "monotonic_ns", "value", "uncertainty_ns")  # columns of numbers
 LARGEST = 1e150  # larger values are not drawn, because matplotlib multiplies values
-# rows are a pause apart if their interval exceeds PAUSE_NS, and PAUSE_STEPS times both neighbouring intervals
+# The time between two rows is a pause if it is longer than PAUSE_NS, and longer than PAUSE_STEPS times the
+# interval before it and PAUSE_STEPS times the interval after it.
 PAUSE_NS, PAUSE_STEPS = 2 * 10**9, 5
 MOST_ROWS = 100_000_000  # limit of a recording's rows, which then take 5 GB of memory
 MOST_NAMES = 4096  # limit of the number of different names: of drives, of registers, and of statuses
@@ -151,7 +152,7 @@ class Recording:
     metadata: Mapping[str, Any]
     series: tuple[Series, ...]
     truncated: int  # number of skipped bytes at the recording's end
-    steps: tuple[StepSpan, ...] = ()  # steps of a test run, each with its phase's name
+    steps: tuple[StepSpan, ...] = ()  # steps of a test run, named by their phases
     events: tuple[Event, ...] = ()  # in the order of their times
 
     @property

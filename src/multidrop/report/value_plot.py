@@ -160,7 +160,10 @@ def _reasons(series: Sequence[Series]) -> str:
 
 
 def _panels(chosen: Sequence[Series], registers: Sequence[str]) -> list[Panel]:
-    """Return a panel for each register and unit, in the order of `registers` if given, else of FIRST."""
+    """Return a panel for each register and unit.
+
+    The panels are in the order of `registers`, or of FIRST if `registers` is empty.
+    """
     found = dict.fromkeys(map(_panel, chosen))
     order = {name: at for at, name in enumerate(registers or FIRST)}
     return sorted(found, key=lambda panel: (order.get(panel.register, len(order)), panel.unit == RAW))
@@ -275,7 +278,7 @@ def _mark_events(axes: Sequence[Axes], events: Sequence[Event]) -> None:
 
 
 def _shade(axes: Axes, content: Content, faults: Sequence[Series]) -> None:
-    """Shade the times of a drive's faults behind its curves or lanes."""
+    """Shade the times of a drive's faults behind its curves or its rows of states."""
     shade: dict[str, Any] = {"color": FAULT, "alpha": 0.08, "lw": 0}
     for one in faults:
         rows = [row for row, lane in enumerate(content.lanes) if lane.drive == one.drive]
@@ -336,9 +339,10 @@ class Lane:
 
 
 def lanes_of(series: Sequence[Series]) -> tuple[list[Lane], int]:
-    """Return a panel's lanes, and the number of lanes for which there is no room.
+    """Return the lanes to draw in a panel, and the number of lanes for which there is no room.
 
-    Bits that are never set are dropped first.
+    A lane is a row of a panel with the states of a drive, or of one of its bits, over time. If there are too
+    many, those of bits that were never set are left out first, and are not counted.
     """
     found = list(chain.from_iterable(map(_lanes, series)))
     if len(found) > MOST_LANES:

@@ -125,7 +125,10 @@ class RowReceiver(Protocol):
     """A receiver of rows. Its methods are called in the forwarder's thread, and may hang."""
 
     def begin(self, log: str) -> SpoolPosition:
-        """Connect, and return which messages of this spool the receiver has. Raises OSError."""
+        """Connect, and return which of the spool's messages the receiver has. Raises OSError.
+
+        `log` is the spool's id.
+        """
 
     def write(self, message: Outgoing, after: SpoolPosition) -> None:
         """Send a message, and store `after`, the spool's position once the message has arrived.
@@ -140,7 +143,7 @@ class RowReceiver(Protocol):
 class RepeatingReceiver:
     """A receiver that may get a message twice: its position is kept in a file in the spool's folder.
 
-    `deliver(message)` returns once the message's rows have arrived. It may raise the errors of `write`.
+    `deliver(message)` returns once the message's rows have arrived. It may raise Refused or another OSError.
     """
 
     def __init__(self, folder: Path, deliver: Callable[[Outgoing], object]) -> None:
@@ -189,7 +192,7 @@ class RowForwarder(RetryingSender):
         # until the receiver is asked: assume that it has none of the stored messages
         self._position = SpoolPosition(max(0, state.oldest - 1))
         self._is_asked = False
-        self._accepted = 0  # messages sent since the gateway's start
+        self._accepted = 0  # messages that the receiver accepted since the gateway's start
         # value of `_accepted` at the first refusal of a message, by the message's number
         self._refusals: dict[int, int] = {}
         spool.acknowledge(self._position.newest)
@@ -326,14 +329,17 @@ class Forwarding:
         self._spool.append(self._without_former_drives(batch) if self._changed else batch)
 
     def adopt(self, plant: Plant) -> None:
-        """Use the units of another plant from now on."""
+        """Use another plant: store the measuring units of its registers with all later rows."""
         self._adopted_ns = monotonic_ns()
         self._changed = changed_drives(self._plant, plant)
         self._plant = plant
         self._note_units(self._adopted_ns)
 
     def _without_former_drives(self, batch: Batch) -> Batch:
-        """Return the batch without rows of changed drives from before the reload: their units are unknown."""
+        """Return the batch without old rows: rows of changed drives that were polled before the reload.
+
+        It is unknown which measuring units the values of old rows have.
+        """
         columns = batch.columns()
         former = {code for code, name in enumerate(columns.drives) if name in self._changed}
         rows = enumerate(zip(columns.drive, columns.monotonic_ns, strict=True))

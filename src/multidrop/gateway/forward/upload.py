@@ -35,7 +35,7 @@ Settings = UploadSettings
 
 
 def build(settings: UploadSettings, context: PartContext) -> Forwarding:
-    """Return the forwarder to the URL. Raises OSError if the token cannot be read."""
+    """Return the forwarder that posts rows to `settings.url`. Raises OSError if the token cannot be read."""
     token = secret_in(settings.token, context.plant)
     headers = {"content-type": "application/json"} | ({"authorization": f"Bearer {token}"} if token else {})
 

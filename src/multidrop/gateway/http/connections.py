@@ -184,7 +184,7 @@ class Turns:
     def __init__(self) -> None:
         self.stops: deque[asyncio.Future[None]] = deque()
         self.others: deque[asyncio.Future[None]] = deque()
-        self._is_taken = False  # True: a request was started in this round
+        self._is_taken = False  # True: the event loop's present round has started a request
 
     async def wait(self, waiting: deque[asyncio.Future[None]]) -> None:
         """Wait until a request in the queue `waiting` may start."""

@@ -92,7 +92,7 @@ def make_app(gateway: Gateway) -> ASGIApp:
     others = Starlette(routes=routes, exception_handlers=handlers)
 
     async def app(scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer requests for frames, which are the most frequent ones, without the router."""
+        """Answer without the router if the path is FRAME, because most requests have this path."""
         await (pages.frame if scope["path"] == FRAME else others)(scope, receive, send)
 
     return Guard(
@@ -107,7 +107,7 @@ def make_app(gateway: Gateway) -> ASGIApp:
 
 
 def _endpoint(pages: Pages, operation: Operation) -> Any:
-    """Return the function that answers a route; it compresses answers to GET, except frames."""
+    """Return the function that answers a route. It compresses answers to GET that are not compressed yet."""
     handler = getattr(pages, operation.handler)
     if operation.method == "POST" or operation.path == FRAME:
         return handler
@@ -333,7 +333,7 @@ class Pages(PageFiles):
         return await _answer_stop(stopping, partial(_answer_all, caller))
 
     async def stop_fleet(self, request: Request) -> Response:
-        """Stop all drives of the fleet. This needs a commander's key: `commander` in `[serve.fleet]`."""
+        """Stop all drives of the fleet. This needs the key file that `commander` in `[serve.fleet]` names."""
         part: Any = self._gateway.feeds.get("fleet")
         if part is None or not part.can_stop:
             raise Denied(404, "this gateway cannot stop the fleet; add commander to [serve.fleet]")
@@ -373,7 +373,7 @@ class Pages(PageFiles):
         return self._stops.begin(what, lambda: supervisor().start("stop", work()))
 
     def _admission(self, drive: str, command: object, body: Mapping[str, Any]) -> Admit:
-        """Return a function that admits a command only if its sender's page has recent values."""
+        """Return a function that admits a command only if its sender has seen recent values of the plant."""
         frames = self._gateway.seen_frames
         return lambda what: frames.admit(drive, what, (drive, command), frame_in(body))
 

@@ -116,7 +116,7 @@ class Alarms:
         self._lasting: dict[tuple[str, str, str], Alarm] = {}
         self._ended: deque[Alarm] = deque(maxlen=MOST_ENDED)
         self._known: set[tuple[str, str]] = set()  # lines and drives whose state was seen before
-        # number of commands that can end a motor's run, counted when it was first seen running; by drive
+        # By drive: the argument `stops` of `look` when the motor was first seen running.
         self._runs: dict[str, int] = {}
         # time at which a motor was first seen at rest after running, by drive
         self._stands: dict[str, int] = {}
@@ -346,9 +346,9 @@ class Limits:
     def exceeded(self, now_s: float, drive: str, values: Mapping[str, float], before: str) -> str:
         """Return a text with the drive's exceeded limits; "" if there are none.
 
-        `values` has the current values by register. While a value is missing, its limit stays as it was
-        (exceeded or not), and `lasting_s` starts again afterwards. `before` is the text that the previous
-        call returned, or the text of an alarm of an earlier run.
+        `values` has the current values by register. While a value is missing, its limit stays as it was,
+        exceeded or not. The time that the value has been beyond the limit is then counted from 0 again.
+        `before` is the text that the previous call returned, or an alarm's text from an earlier run.
         """
         found = []
         for limit in self._of.get(drive, ()):

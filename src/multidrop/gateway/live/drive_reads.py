@@ -36,7 +36,7 @@ _log = logging.getLogger("multidrop.gateway")
 
 
 class SideReads:
-    """Reads the unpolled registers of drives that a page shows, one read at a time per line.
+    """Reads registers that are not polled, for the web page of a drive. Each line has one read at a time.
 
     `is_there` returns whether a drive answers.
     """
@@ -59,7 +59,10 @@ class SideReads:
         self._tasks: dict[str, asyncio.Task[None]] = {}
 
     def look(self, plant: Plant, name: str) -> ReadValues:
-        """Return the values read so far; read on for LOOKED_S. Raises ValueError for an unknown drive."""
+        """Return the values read so far, and continue reading in the background for LOOKED_S seconds.
+
+        Raises ValueError for an unknown drive.
+        """
         line, drive = plant.find_drive(name)
         self._looked[name] = self._clock()
         found = self._found.setdefault(name, {})
@@ -148,7 +151,7 @@ class Identities:
         self._refused: dict[str, str] = {}  # reason of the failed check that was logged last, by drive
 
     async def run(self) -> None:
-        """Check all drives in rounds, forever, because drives may answer again and ports may be reopened."""
+        """Check the identities of all drives again and again, because a silent drive may answer later."""
         while True:
             drives = [(line.name, polled.drive) for line in self._plant().lines for polled in line.drives]
             for line, drive in drives:

@@ -107,7 +107,7 @@ def _age_ms(now: Times, asked: Times) -> int:
 
 
 class TimeNumbers(dict[Times, int]):
-    """Numbers the request times of values from 0. Values that were requested together share a number."""
+    """A dict that gives each request time a number: 0, 1, 2 and so on. Equal times have the same number."""
 
     def __missing__(self, time: Times) -> int:
         self[time] = number = len(self)
@@ -117,9 +117,10 @@ class TimeNumbers(dict[Times, int]):
 def _unknown(
     hub: Hub, newest: KeptRow | None, good: KeptRow | None, times: TimeNumbers, now: Times
 ) -> tuple[Any, ...]:
-    """Return the entry of a value that is not fresh: None, an index into `ages_ms`, and the reason.
+    """Return what a message says about a register without a fresh value.
 
-    If an earlier read succeeded, its value and the index of its age follow.
+    These are None, an index into `ages_ms`, and the reason. If an earlier read succeeded, its value and the
+    index of its age follow.
     """
     if newest is None:
         return None, times[now], "not asked yet"
@@ -178,8 +179,8 @@ class Frames:
         self._clock = clock
         self._begin = begin
         self._kept: deque[dict[str, Any]] = deque(maxlen=KEPT)  # newest messages, the newest last
-        # The newest message as bytes: its changes since an older message, by the number of the older message.
-        # The key WHOLE has the whole message.
+        # The newest message as bytes. Under an older message's number: only the changes since that message.
+        # Under WHOLE: the whole message.
         self._encoded: dict[int, Encoded] = {}
         self._due = 0.0
         self._timer: asyncio.TimerHandle | None = None
@@ -279,11 +280,12 @@ def _let_go(turn: asyncio.Future[None]) -> None:
 
 
 class SeenFrames:
-    """Protects commands over HTTP from networks that delay or repeat them.
+    """Refuses commands over HTTP that a network has delayed or repeated.
 
-    A write, or a verb that may start a motor, contains the number of the newest message to its sender's page.
-    The command is sent once, within MOST_AGE_S of that message, and only if neither a stop of the drive nor a
-    reload followed the message. Clocks of other computers are not used.
+    Viewers get the plant's state in numbered messages, the frames. A write, or a verb that may start a motor,
+    contains the number of the newest frame that its sender has received. The command is sent once, within
+    MOST_AGE_S after that frame was made. It is refused if the drive was stopped, or the plant file reloaded,
+    after the frame was made. Clocks of other computers are not used.
 
     `clock` returns a time in ns that goes on while the computer sleeps.
     """
@@ -291,12 +293,12 @@ class SeenFrames:
     def __init__(self, clock: Callable[[], int], commands: Commands) -> None:
         self.clock = clock
         self._commands = commands
-        self._made: dict[int, int] = {}  # time at which a message was made (ns), by its number
-        # commands admitted from senders that have a message to the page, by number of this message
+        self._made: dict[int, int] = {}  # time at which a frame was made (ns), by its number
+        # admitted commands, by the frame number that they contain
         self._came: dict[int, set[object]] = {}
 
     def note(self, n: int) -> None:
-        """Record that message `n` to the page is made now."""
+        """Record that frame `n` is made now."""
         now_ns = self.clock()
         self._made[n] = now_ns
         for old in [one for one, made_ns in self._made.items() if now_ns - made_ns > MOST_AGE_NS]:
@@ -304,12 +306,11 @@ class SeenFrames:
             self._came.pop(old, None)
 
     def admit(self, drive: str, what: str, command: object, seen: int) -> int:
-        """Admit a command. `seen` is the number of the newest message that its sender's page has received.
+        """Return the time in ns until which a command may be sent.
 
-        Return the time in ns until which the command may be sent.
-
-        Raises WriteForbidden in these cases: the message is too old, the command repeats another, or the
-        message was made before a reload or before a stop of the drive.
+        `seen` is the number of the newest frame that the command's sender has received. Raises WriteForbidden
+        if this frame is too old, or if the plant file was reloaded or the drive stopped after it was made.
+        Also raises WriteForbidden if the command repeats another.
         """
         made_ns = self._made.get(seen)
         until_ns = 0 if made_ns is None else made_ns + MOST_AGE_NS

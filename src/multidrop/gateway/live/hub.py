@@ -180,8 +180,8 @@ class Hub:
         self.taken = 0  # number of batches received
         self.unopened: dict[str, str] = {}  # why a port could not be opened, by line
         self.stalled: dict[str, str] = {}  # why an open port accepts no bytes, by line
-        # rows of a register; key: one number made of a batch's drive code and register code;
-        # None: the register is not in the plant
+        # Rows of a register; None for a register that is not in the plant. The key combines the register's
+        # drive code and register code in a batch.
         self._cells: dict[int, RegisterRows | None] = {}
         self._statuses: tuple[str, ...] = ("ok",)
         self._watched: dict[str, _WatchedDrive] = {}

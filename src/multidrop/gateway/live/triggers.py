@@ -95,12 +95,15 @@ class Triggers:
             _log.info("trigger %s: %s", trigger.name, trigger.condition)
 
     def adopt(self, plant: Plant) -> None:
-        """Use another plant. No condition is evaluated until `run` has prepared them for this plant."""
+        """Use another plant. Conditions are not evaluated until `run` has prepared them for this plant."""
         self._plant, self._conditions = plant, None
         self._is_new.set()
 
     async def run(self) -> None:
-        """Prepare the conditions for each adopted plant. Raises ValueError if one does not fit the plant."""
+        """Prepare the conditions after each call of `adopt`.
+
+        Raises ValueError if a condition does not fit the plant.
+        """
         while True:
             await self._is_new.wait()
             self._is_new.clear()
@@ -114,9 +117,9 @@ class Triggers:
         """Return immediately, because triggers are only in memory."""
 
     def as_answer(self) -> list[dict[str, Any]]:
-        """Return the last trigger of each name for clients, the newest first.
+        """Return the last trigger of each name as JSON objects, the newest trigger first.
 
-        Each has the time range that a page shows around it.
+        `from` and `to` are the time range to show in a plot of the trigger.
         """
         pre_ns, post_ns = self._around_ns
         return [
@@ -145,12 +148,14 @@ class _Conditions:
             series
             for text, signals in found.signals.items()
             for series in signals
-            # the trigger of a fault lists all polled registers of its drive, but is computed from one
+            # The signals of a fault's condition are all polled registers of the drive, but only the fault
+            # register is needed to evaluate it.
             if text in conditions.values() or series[1] == FAULT
         }
         self._inputs = {series: slot for series, slot in self._channels.inputs.items() if series in needed}
         self._by_slot = {slot: name for name, slot in self._channels.slots.items()}
-        # index of a register among the inputs of the conditions, by the batch's drive code and register code
+        # Number of a register among the inputs of `_channels`. The key is the register's drive code and
+        # register code in a batch.
         self._slots: dict[tuple[int, int], int] = {}
         self._sizes = (0, 0)  # how many drive names and register names the newest batch has
         self._was: dict[int, bool] = {}  # whether each condition, by its index, was true before
@@ -188,10 +193,10 @@ class _Conditions:
 def _with_triggers_only(
     drive: DriveSeries, triggers: Container[TriggerSeries], holds_s: Mapping[TriggerSeries, float]
 ) -> DriveSeries:
-    """Return a drive's series that computes only triggers. The drive's other channels become inputs.
+    """Return a drive's series in which only the triggers are computed; its other channels are inputs.
 
-    The values of these inputs come from the poller's rows. There, a total continues after a restart; a total
-    computed here would start again.
+    The poller has computed the values of these channels already. For a total, such as kWh, this matters: the
+    poller's total continues after a restart, but a total computed here would start at 0.
     """
     own = [channel for channel in drive.channels if (drive.name, channel.name) not in triggers]
     inputs = {channel.name: (channel.unit, holds_s[drive.name, channel.name]) for channel in own}

@@ -273,7 +273,7 @@ def audit_trouble_of(gateway: Gateway) -> str:
 
 
 def troubles_of(gateway: Gateway) -> list[str]:
-    """Return a sentence for the page about each problem, except lost lines."""
+    """Return a sentence for the page about each problem of the gateway. A lost port is an alarm instead."""
     troubles = {f"line {line}": why for line, why in failing_lines_of(gateway).items()}
     troubles |= supervisor().hung | supervisor().dead
     troubles |= {name: one for name, one in parts_of(gateway).items() if one != "ok"}

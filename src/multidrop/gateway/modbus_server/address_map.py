@@ -55,8 +55,8 @@ class AddressRow(NamedTuple):
     note: str = ""
 
 
-# A function that makes an AddressRow of one drive. Its arguments are the value's name, and the row's fields
-# from `access` on.
+# A function that makes an AddressRow of one drive. Its first argument is the name of the value in this row;
+# the others are the row's remaining fields, `access` first.
 MakeRow = Callable[..., AddressRow]
 
 

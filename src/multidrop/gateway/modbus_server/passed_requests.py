@@ -37,7 +37,7 @@ BURST_S = 0.2  # limit, in s, of unused bus time that is saved for later request
 MOST_WAITING = 8  # limit of the requests that wait for one line
 EXPIRY_S = 1.0  # in s: a request that has waited for this long is dropped
 CLOSED = "the gateway is shutting down, or has read its plant file again"
-# in s: if the gateway did not run, it then refuses writes for this long, because they may be old
+# in s: after a pause of the whole gateway, such as the computer's sleep, it refuses writes for this long
 SETTLE_S = 1.0
 # in s: how long the answer to a stop waits for the motor; less than the usual timeout of clients
 STOP_WAIT_S = 0.4
@@ -69,9 +69,10 @@ class LineShare:
     def ask(self, client: object, work: Callable[[float], Awaitable[Any]]) -> asyncio.Future[Any]:
         """Queue a request, and return a future of its result.
 
-        `work` sends the request; it is called with the seconds until the request expires. If the request is
-        dropped, this call or the future raises PassingBusy. If the queue is full and another client has at
-        least two more waiting requests, the last request of that client is dropped instead.
+        `work` sends the request; it is called with the seconds until the request expires. If the queue is
+        full, one request is dropped: the last one of the client with the most waiting requests, if that
+        client has at least two more than `client` has. Otherwise the new request is dropped. The future of a
+        dropped request raises PassingBusy; for the new request this call itself raises it.
         """
         if len(self._waiting) >= MOST_WAITING:
             self._make_place(client)
@@ -110,7 +111,7 @@ class LineShare:
     # ---- turns ----
 
     def _step(self) -> None:
-        """Start the next request now, or as soon as the share of bus time allows it."""
+        """Start the next request now, or later if the clients' requests have used up their bus time."""
         if self._running is not None or not self._waiting:
             return
         now = self._loop.time()
@@ -165,7 +166,7 @@ class LineShare:
 
 
 class Standstill:
-    """Detects that the gateway did not run for more than MOST_AGE_S, and then refuses writes for SETTLE_S.
+    """Detects pauses of the gateway of more than MOST_AGE_S, and refuses writes for SETTLE_S after each.
 
     For example, the computer may have slept. Writes that arrive afterwards may be old, and a Modbus
     request contains no time that would show it.
@@ -188,7 +189,7 @@ class Standstill:
     def admit(self, what: str) -> float:
         """Return the deadline for sending a write that is received now (CLOCK_BOOTTIME, ns).
 
-        Raises WriteForbidden if the gateway did not run a moment ago: the write may have waited since then.
+        Raises WriteForbidden within SETTLE_S after a pause of the gateway, because the write may be old.
         """
         self.note()
         if self._ran_ns < self._until_ns:
@@ -298,7 +299,7 @@ class ClientWrites:
             self._commands.note_refused(line, drive, what, why, self._caller(client))
 
     def _begin_stop(self, unit: Unit, client: WritingClient) -> asyncio.Future[int]:
-        """Start a stop; a stop beyond many that are in progress is joined with others, and starts later."""
+        """Start a stop. If many stops of the drive are in progress, start one common stop a little later."""
 
         def start() -> asyncio.Task[int]:
             return supervisor().start("modbus stop", self._stop_one(unit, self._caller(client)))

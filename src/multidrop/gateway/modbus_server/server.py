@@ -123,7 +123,11 @@ class ModbusClient(asyncio.Protocol):
         return bool(self._under_way or self._waiting or self._is_draining)
 
     def pause_writing(self) -> None:
-        """Hold back the answers of a client that does not read them, but still accept its requests."""
+        """Note that the client does not read its answers.
+
+        asyncio calls this when its write buffer is full. From now on, no request of this client is answered,
+        but further requests are received.
+        """
         self._stalled_since = self._port.clock()
 
     def resume_writing(self) -> None:
@@ -186,7 +190,7 @@ class ModbusClient(asyncio.Protocol):
         self._came.clear()
 
     def _answer_some(self) -> bool:
-        """Answer queued requests until the turn ends; return True if more can be answered."""
+        """Answer at most SLICE requests, for `RoundShare.slice_s`. Return True if more can be answered."""
         begun = self._port.clock()
         answers: list[bytes] = []
         for _ in range(SLICE):
@@ -255,7 +259,10 @@ class ModbusClient(asyncio.Protocol):
 
 
 class RoundShare:
-    """Divides the duration of a round among the clients, on all ports, that have requests waiting."""
+    """Divides the event loop's time among all clients with waiting requests.
+
+    In a round, each of these clients has one turn, in which some of its requests are answered.
+    """
 
     def __init__(self) -> None:
         self._busy: set[ModbusClient] = set()
@@ -381,7 +388,7 @@ class ModbusServer:
         self._standstill = Standstill()
         self._writes = ClientWrites(commands, role, "modbus", settings.common_addresses, self._standstill)
         self._shares: dict[str, LineShare] = {}
-        self._sockets: dict[str, Any] = {}  # listening sockets by line, like `ports`
+        self._sockets: dict[str, Any] = {}  # listening socket of each port, with the keys of `ports`
         self._listening: list[ModbusPort] = []
 
     # ---- start and end ----

@@ -55,7 +55,7 @@ class ModbusSettings:
     may: str = field(default="look", metadata={"enum": [*ROLES]})
     # Addresses and networks from which clients may connect; empty: only from this computer.
     clients: Sequence[str] = field(default=(), metadata={"items": {"type": "string", "pattern": NETWORK}})
-    # Address of the common block, which has the same values for every drive.
+    # Address of the common block: state, fault, frequency and more, at the same addresses for every drive.
     common: int = field(default=0xF000, metadata={"minimum": 0, "maximum": 0x10000 - COMMON_LENGTH})
     # Address of the block with a drive's computed channels.
     channels: int = field(default=0xF100, metadata={"minimum": 0, "maximum": 0xFFFF})
@@ -64,7 +64,7 @@ class ModbusSettings:
         refuse(self._mistakes())
 
     def check(self, plant: Plant) -> list[str]:
-        """Return a sentence for each conflict with the plant, such as two drives with the same unit id."""
+        """Return a sentence for each setting that does not fit the plant, such as a unit id of two drives."""
         try:
             Units(plant, self)
         except ValueError as mistakes:
@@ -244,10 +244,11 @@ class Unit:
 
 
 def _stop_writes(drive: Any) -> Iterator[StopWrite]:
-    """Yield each register and raw value that stop the motor: the first write of each stop verb of the family.
+    """Yield the writes that stop a drive's motor, as pairs of register and raw value.
 
-    Also yield the other raw values in `harmless` of the same registers' declarations, such as YD1000's 8000H.
-    Omit 0, which may mean "no command".
+    These are the first write of each stop verb of the drive's family, and the raw values that the family's
+    declaration of the same register lists as harmless, such as YD1000's 8000H. A harmless 0 is left out,
+    because it may mean "no command".
     """
     for name in _STOPS:
         try:

@@ -28,7 +28,7 @@ class End(Protocol):
 
     @property
     def address(self) -> str:
-        """The tool's address for logs: a path or an IP address."""
+        """The PC tool's address as text, for log messages: a path or an IP address."""
 
     def fileno(self) -> int: ...
     def read(self) -> bytes | None:
@@ -38,7 +38,7 @@ class End(Protocol):
         """Send bytes; drop them if the tool does not read fast enough."""
 
     def discard(self) -> None:
-        """Drop sent bytes that the tool has not read, if that is possible."""
+        """Drop the sent bytes that the PC tool has not read. Over TCP this does nothing."""
 
     def close(self) -> None: ...
 
@@ -154,7 +154,7 @@ class Connection:
             self._peer.send(data)
 
     def discard(self) -> None:
-        """Keep sent bytes, because TCP cannot take them back."""
+        """Do nothing, because bytes that were sent over TCP cannot be taken back."""
 
     def close(self) -> None:
         self._peer.close()

@@ -69,9 +69,10 @@ REST_S = 0.2  # in s: an incomplete request is dropped if no byte arrives for th
 PLAN_S = 60.0  # time limit, in s, for computing the share of bus time that polling uses
 IDLE_S = 300.0  # in s: a TCP connection without a request for this long is closed
 SWEEP_S = 1.0  # interval, in s, of checking for idle connections
-# the answer to a stop waits for the motor, and a read waits for the line, for at most this share of `timeout`
+# Share of `timeout` after which a request is answered at the latest: a stop although the motor still runs,
+# and a read although the line was not free.
 WAIT_SHARE = 0.75
-# Exception codes for a drive that cannot be reached. On a real line, a tool would get no reply then.
+# Errors of drives that cannot be reached. The PC tool then gets no reply, as if it were on the line itself.
 _UNREACHABLE = (ModbusCode.NO_PATH, ModbusCode.NO_RESPONSE)
 _log = logging.getLogger("multidrop.gateway")
 # A function that starts a request. It returns None if the request gets no answer. Else it returns an
@@ -81,7 +82,7 @@ Serve = Callable[[MbapRequest, "Tool"], Awaitable["bytes | None"] | None]
 
 @dataclass(frozen=True)
 class ToolSettings:
-    """The settings of the tool ports. Raises ValueError with a line for each mistake."""
+    """The settings of the ports for vendors' PC tools. Raises ValueError with a line for each mistake."""
 
     # Path of the symbolic link to a line's pseudo-terminal, by line.
     pty: Mapping[str, str] = field(default_factory=dict, metadata={"additionalProperties": _TEXT})
@@ -91,7 +92,7 @@ class ToolSettings:
     )
     # The role of all connected PC tools: "look", "stop" or "write".
     may: str = field(default="look", metadata={"enum": [*ROLES]})
-    # Addresses and networks that may connect to `rtu`; empty: only this computer.
+    # Addresses and networks that may connect to the TCP ports in `rtu`; empty: only this computer.
     clients: Sequence[str] = field(default=(), metadata={"items": {"type": "string", "pattern": NETWORK}})
     # Time limit, in s, for the answer to a request. It should be shorter than the tool's own timeout.
     timeout: float = field(default=0.4, metadata={"minimum": LEAST_TIMEOUT_S, "maximum": MOST_TIMEOUT_S})
@@ -152,7 +153,7 @@ Settings = ToolSettings
 
 
 def build(settings: ToolSettings, context: PartContext) -> ToolPorts:
-    """Open the tool ports and return them. Raises OSError if one cannot be opened."""
+    """Open and return the ports for vendors' PC tools. Raises OSError if one cannot be opened."""
     plant, hub, commands, folder = context.plant, context.hub, context.commands, context.folder
     ports = ToolPorts(plant, hub, commands, settings, context.ask, folder)
     ports.listen()
@@ -192,7 +193,7 @@ class Tool:
             self._loop.call_later(PAUSE_S, self._listen)
 
     def _take_in(self) -> bool:
-        """Read received bytes and start their requests; return False if the tool has disconnected."""
+        """Read bytes from the PC tool, and start their requests. Return False if it has disconnected."""
         try:
             data = self._end.read()
         except OSError as failure:
@@ -217,9 +218,9 @@ class Tool:
                 _log.exception("a request of tool %s failed", self.address)
 
     def _drop_rest(self) -> None:
-        """Drop an incomplete request, but first read bytes that arrived while the event loop was busy.
+        """Read from the PC tool once more. If that brings nothing, drop the incomplete request.
 
-        If these bytes do not complete it, serve any complete requests after it: one may be a stop.
+        Then serve the complete requests that follow it, because one of them may be a stop.
         """
         self._rest = None
         if self._take_in() and self._rest is None:
@@ -273,7 +274,7 @@ class Tool:
 
 
 class ToolLine:
-    """Serves the requests of the PC tools that are connected to one line. They address its drives."""
+    """Serves the requests of PC tools to the drives of one line."""
 
     def __init__(
         self,
@@ -332,9 +333,10 @@ class ToolLine:
     async def _passed(
         self, unit: Unit, request: MbapRequest, start: int, count: int, tool: Tool
     ) -> bytes | None:
-        """Read from the drive as soon as the line's bus time for PC tools allows it.
+        """Read from the drive, and return the answer to the PC tool.
 
-        Answer "busy" if the read has not started within WAIT_SHARE of the timeout.
+        The read may have to wait, because PC tools get only a share of the line's time. If it has not started
+        within WAIT_SHARE of the timeout, the answer is "busy".
         """
         is_begun = False
         until = asyncio.get_running_loop().time() + self._timeout
@@ -365,7 +367,7 @@ class ToolLine:
 
 
 def _exception(request: MbapRequest, code: int) -> bytes | None:
-    """Return the frame of an exception reply; None if a tool on a real line would get no reply."""
+    """Return the frame of an exception reply; None if the drive cannot be reached."""
     return None if code in _UNREACHABLE else request.exception(code)
 
 

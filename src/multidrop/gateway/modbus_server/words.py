@@ -58,14 +58,18 @@ class Unavailable(Enum):
 
 
 def is_fresh(row: Newest | None, now_ns: int, since_ns: int = 0) -> bool:
-    """Return True if a read succeeded, its value is not too old, and it was not sent before `since_ns`."""
+    """Return True if a row has a value that is not too old and was not requested before `since_ns`."""
     if row is None or row.value is None:
         return False
     return row.monotonic_ns >= since_ns and now_ns - row.monotonic_ns <= row.holds_ns
 
 
 def is_certain(register: Register[Any]) -> bool:
-    """Return True if the raw words can be computed from most values of this register."""
+    """Return True if a value of this register determines the words that the drive sent.
+
+    This is not so for a register with only a part of a word, with a scale in another register, or with one of
+    the number formats in _OPEN.
+    """
     coding = register.coding
     return register.part is None and not register.scale_register and coding.number_format not in _OPEN
 
@@ -152,7 +156,7 @@ class DriveWords:
 
     def __init__(self, polled: PolledDrive) -> None:
         self._at: dict[tuple[int, int], list[tuple[_PolledRegister, int]]] = {}
-        self.registers: set[str] = set()  # names of the registers whose words are usually known
+        self.registers: set[str] = set()  # names of the registers for which `is_certain` is True
         for poll in polled.polls:
             register = poll.register
             function = reading_function(register.table)
@@ -217,10 +221,13 @@ def _newest_word(
 
 
 class CommonNumber(NamedTuple):
-    """A number of the common block, as the address map describes it."""
+    """A number in the common block: the addresses with the same meaning for every drive.
+
+    The address map, a table for the users of Modbus clients, has these fields too.
+    """
 
     name: str
-    at: int  # offset in the common block, in words
+    at: int  # number of words before this number in the block
     words: int
     format: str
     step: float
@@ -260,7 +267,7 @@ class CommonBlock:
         )
 
     def words(self, hub: Hub, now_ns: int) -> list[int]:
-        """Return the words of the block at the monotonic time `now_ns`."""
+        """Return all words of the drive's common block at the monotonic time `now_ns`."""
         state, woke_ns = hub.state(self._name), hub.woke_ns()
         words = [0] * COMMON_LENGTH
         words[STATE] = STATES.get(state, 0)

@@ -168,9 +168,9 @@ def make_client(address: Address, login: Login, name: str) -> Any:
 
 
 class Messages(Protocol):
-    """Makes the messages of one connection and handles received ones: JsonTopics or SparkplugNode.
+    """The format of one connection's messages. It makes sent messages and handles received ones.
 
-    The methods run in the event loop.
+    JsonTopics and SparkplugNode implement it. The methods run in the event loop.
     """
 
     def will(self) -> Publication:

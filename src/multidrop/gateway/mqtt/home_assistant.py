@@ -30,7 +30,7 @@ CLASSES = {  # device_class of a sensor in Home Assistant, by unit
 }
 # ids of the other components end with these words, so a register with such a name gets another id
 OWN = ("problem", "running", "set", "value")
-MOST = 1e12  # largest absolute value in the range of a number
+MOST = 1e12  # limit of `min` and `max` of a component of the kind "number"
 LEAST_STEP = 0.001  # smallest step of a number that Home Assistant accepts
 STALE_PERIODS = 3  # a sensor becomes unavailable if no value is published for this many publishing periods
 # Template of the commands that Home Assistant sends. They contain the time of its clock, so that the gateway
@@ -202,7 +202,8 @@ def _choices(register: Register[Any]) -> dict[str, int]:
 def _value_template(register: Register[Any]) -> str:
     """Return the template by which Home Assistant reads a polled register's value.
 
-    If the register's values have names, a raw count without a name is shown as `unknown`.
+    If the register's values have names, the template returns "None" for any other value. Home Assistant then
+    shows the state `unknown`.
     """
     value = f"value_json['values']['{register.name}']"
     if names := list(_choices(register)):

@@ -91,7 +91,8 @@ class RetainedTopics:
         self._looked_at += 1
         drive = self._drive_in(_state_topic(payload))
         if drive is None or drive in there or topic != discovery_topic(self._prefix, drive):
-            return []  # the message is from another gateway, whose prefix starts with this gateway's prefix
+            # the plant has this drive, or another gateway published the message
+            return []
         return [KeptTopic(drive, topic)]
 
     def _drive_in(self, topic: str) -> str | None:

@@ -61,7 +61,8 @@ class Mqtt:
     def forward_rows(self, settings: MqttSettings, context: PartContext) -> None:
         """Publish every polled value, in addition to each register's newest value.
 
-        Raises ImportError without pyarrow, ValueError for an invalid spool.
+        Values wait on the disk while the broker does not answer, in the folder `spool`. Raises ImportError
+        without pyarrow, and ValueError for an invalid folder.
         """
         from multidrop.gateway.mqtt.rows import json_rows, sparkplug_rows
 

@@ -317,7 +317,10 @@ class SparkplugNode:
                 self._put(drive, "DDATA", self._data)
 
     def leave(self) -> None:
-        """Send the node's death, because a regular disconnect does not send the will."""
+        """Publish that the node is offline (its death certificate).
+
+        After a regular disconnect, the broker does not publish the connection's last will.
+        """
         self.outbox.put(Publication(self._topic("NDEATH"), self._death, qos=1))
 
     # ---- historical values ----
@@ -332,11 +335,12 @@ class SparkplugNode:
         return known, metrics.get(register)
 
     async def send_past(self, values: Sequence[PastValue], confirm: Callable[[], Awaitable[None]]) -> None:
-        """Send values as historical values, and wait for them.
+        """Send values as historical values, and wait until the broker has received them.
 
-        `confirm` waits until the broker has received them. Raises OSError if `confirm` does, or if values are
-        not sent. Values of drives and registers without a metric are left out. If a drive is silent, its
-        birth is sent first, and its death at the next call of `publish`.
+        `confirm` waits for the broker. Raises OSError if `confirm` does, or if values are not sent. Values of
+        drives and registers that the node does not publish are left out. If a drive is silent, its birth
+        certificate is sent first, because Sparkplug requires one before any value. The next call of `publish`
+        sends the drive's death certificate again.
         """
         metrics = {drive: self._values(drive).keys() for drive in self._hub.drives}
         for begin in range(0, len(values), MOST_PAST):
@@ -361,7 +365,7 @@ class SparkplugNode:
     # ---- payloads; each has a sequence number, so it is made when it is sent ----
 
     def _replace_pending(self, drive: str, kind: str, make: Any) -> None:
-        """Send a drive's birth or death, and drop the drive's other waiting messages."""
+        """Send a drive's birth or death certificate, and drop the drive's other waiting messages."""
         for other in {"DBIRTH", "DDATA", "DDEATH"} - {kind}:
             self.outbox.withdraw(self._topic(other, drive))
         self._put(drive, kind, make)
@@ -422,7 +426,7 @@ class SparkplugNode:
         return found
 
     def _times(self, drive: str) -> dict[str, int]:
-        """Return the time of each metric (UTC, ms): when its value was polled, or now without a value."""
+        """Return a time for each metric (UTC, ms): when its value was polled, or now if it has no value."""
         now = self._utc_ms()
         times = dict.fromkeys(self._values(drive), now)
         for register, newest, good, is_current in self._hub.known(drive):

@@ -71,11 +71,12 @@ _log = logging.getLogger("multidrop.gateway")
 
 @contextmanager
 def lasting() -> Iterator[None]:
-    """Exclude the objects that are made in the `with` block from garbage collection.
+    """Exclude all existing Python objects from garbage collection at the end of the `with` block.
 
-    They last, and the 400,000 objects of the address space would make each garbage collection stop all
-    threads for 0.2 s. An excluded object is still freed when its last reference ends. But objects in a
-    reference cycle, such as the drives of an old plant, are freed only by `free_excluded`.
+    The block makes the nodes of the OPC UA server: 400,000 objects that live as long as the server. With
+    them, each garbage collection would stop all threads for 0.2 s. An excluded object is still freed when its
+    last reference ends. But objects in a reference cycle, such as the drives of an old plant, are freed only
+    by `free_excluded`.
     """
     was_enabled = gc.isenabled()
     gc.disable()
@@ -88,7 +89,7 @@ def lasting() -> Iterator[None]:
 
 
 def free_excluded() -> None:
-    """Collect garbage, also among the objects that `lasting` has excluded. Stops all threads for 0.2 s."""
+    """Collect garbage among all objects, also those that `lasting` excluded. This stops threads for 0.2 s."""
     gc.unfreeze()
     gc.collect()
 
@@ -268,9 +269,9 @@ class PlantNodes:
             del space[node]
 
     async def write(self, states: Iterable[VariableState]) -> None:
-        """Take over these states, and notify their subscribers.
+        """Store these states, and notify their subscribers.
 
-        After every SOME states, other tasks of the event loop run, because a client may send a stop.
+        Each time SOME (64) states are written, other tasks of the event loop run, such as a client's stop.
         """
         for count, state in enumerate(states, 1):
             drive = self._drives.get(state.drive)
@@ -380,7 +381,7 @@ def _unit(parent: ua.NodeId, node: ua.NodeId, unit: str) -> ua.AddNodesItem:
 def _method(
     parent: ua.NodeId, node: ua.NodeId, results: ua.NodeId, description: str
 ) -> Iterator[ua.AddNodesItem]:
-    """Yield the requests to add a method that returns a text, and the description of this text."""
+    """Yield two requests: to add a method, and to add the description of the text that it returns."""
     attributes = ua.MethodAttributes()
     attributes.Description = ua.LocalizedText(description)
     attributes.Executable = attributes.UserExecutable = True

@@ -76,7 +76,11 @@ class OpcUaSettings:
         return {"listen": self.address}
 
     def check(self, plant: Plant) -> list[str]:
-        """Return an error sentence for each missing file, unprotected address and ambiguous name."""
+        """Return an error sentence for each mistake.
+
+        These are a missing certificate or key file, an address that other machines reach without a
+        certificate and tokens, and a name of a drive or channel that gives two nodes the same id.
+        """
         return [*self._mistakes_in(plant)]
 
     def _mistakes_in(self, plant: Plant) -> Iterator[str]:
@@ -122,7 +126,7 @@ class OpcUa:
         self.port: int = self._listener.getsockname()[1]
         self._plant = context.plant
         self._adopted: Plant | None = None  # the plant whose nodes the server shows
-        self._turn = 0  # number of intervals so far
+        self._turn = 0  # number of calls of `_changes` so far
         # state that was passed to the server last, by drive and variable
         self._seen: dict[str, dict[str, Any]] = {}
         # wrong tokens that were logged, so that each is logged once; used only in the server's thread
@@ -131,14 +135,14 @@ class OpcUa:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._serving: asyncio.Future[None] | None = None  # done when the server's thread has ended
         self._opened: tuple[asyncio.AbstractEventLoop, asyncio.Event, PlantNodes] | None = None
-        self._is_over = False  # True: the server ends; one that is still starting ends after its start
+        self._is_over = False  # True: the server ends, or will end as soon as it has started
         # pending while the server takes over a new plant or new values
         self._writing: Future[None] | None = None
 
     # ---- in the gateway's loop ----
 
     def adopt(self, plant: Plant) -> None:
-        """Use another plant. The server gets the plant before the plant's values."""
+        """Use another plant. `run` then passes it to the server, before any values of this plant."""
         self._plant = plant
 
     async def run(self) -> None:
@@ -244,10 +248,10 @@ class OpcUa:
 
     @contextmanager
     def _quick_process(self) -> Iterator[None]:
-        """Shorten the time slices of threads while a server runs. Undo this after the last server.
+        """Shorten the time slices of threads while a server runs.
 
-        Then also let the garbage collector examine again the objects that `lasting` excluded. During a reload
-        there may be two servers: a new one may start before the old one has ended.
+        When the last server has ended, restore the usual time slices, and let the garbage collector examine
+        all objects again. During a reload, two servers may run for a moment.
         """
         _unended.add(self)
         sys.setswitchinterval(SWITCH_S)

@@ -215,7 +215,7 @@ def _check_count(operations: Any) -> None:
 
 
 class _Internal(InternalServer):
-    """asyncua's server without its network connections, with limits."""
+    """asyncua's server without its network connections. It limits sessions, subscriptions and queues."""
 
     def __init__(self, may: HasRight, stop: Stop) -> None:
         self.admission = _Admission(may)
