@@ -190,7 +190,10 @@ class Bus:
         self._leaving.begin()
 
     def part(self) -> None:
-        """Do the same as `leave`, and wait for all pending stops. The port stays open."""
+        """Cancel all calls that move a motor, and wait for all pending stops. The port stays open.
+
+        If `stop_on_exit` is set, all drives are stopped first.
+        """
         self._leaving.finish()
 
     def close(self) -> None:
@@ -531,10 +534,7 @@ class Leaving:
         _warn_of(self.found)
 
     def begin(self) -> None:
-        """Cancel all calls on the bus; start to stop the drives if `stop_on_exit` was called.
-
-        Does not wait for the end of the stops.
-        """
+        """Cancel all calls on the bus. If `stop_on_exit` was called, another thread stops the drives."""
         self._latches.shut()
         if self._exit_task is not None:
             self._exit_task.begin()

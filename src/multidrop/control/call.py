@@ -26,10 +26,10 @@ POLL_S = 0.005  # seconds between checks whether all stops have ended
 
 
 class Latches:
-    """The unfinished stops of a bus, and for each of its drives a `Latch`, with which stops cancel calls.
+    """The unfinished stops of a bus, and one `Latch` for each drive, which cancels the drive's calls.
 
-    A latch counts the stops of its drive. The core sends no write of a call that was made before the newest
-    stop, during a stop, or after the latch was shut.
+    A latch is the core's record of the stops of one drive. The core does not send a call's write if a stop
+    of the drive is unfinished or was called after the call, or if the latch is shut.
     """
 
     def __init__(self, exchanges: Exchanges) -> None:
@@ -57,7 +57,7 @@ class Latches:
             self.latch(drive).shut(REMOVED)
 
     def remove(self, drive: Drive) -> None:
-        """Cancel this drive's calls, wait for its unfinished stops, and remove its latch."""
+        """Cancel this drive's calls, wait for its unfinished stops, and forget the drive."""
         self.end([drive])
         self.await_stops([drive])
         self._latches.pop(drive, None)
@@ -92,7 +92,7 @@ class Latches:
             self.latch(drive).revoke(STOPPED)
 
     def begin(self, stop: object, drives: Sequence[Drive]) -> None:
-        """Start a stop. Until `over(stop)`, cancel and refuse moves of these drives, and keep them attached.
+        """Start a stop. Until `over(stop)`, cancel the calls that move these drives, and keep them attached.
 
         `begin` may be called repeatedly. Neither `begin` nor `over` takes a lock. Each of their steps is
         atomic, so an exception that a signal handler raises leaves no step half done.
@@ -146,20 +146,17 @@ class Call:
 
     @property
     def expires_ns(self) -> int:
-        """The time after which the next write is not sent, in ns of CLOCK_BOOTTIME.
-
-        This time includes the interval that the drive needs between two requests.
-        """
+        """The deadline for sending the call's next write, in ns of CLOCK_BOOTTIME."""
         expires_ns = self._due_ns + round((self.expiry + self.drive.least_interval) * 1e9)
         return expires_ns if self.sent else int(min(expires_ns, self._limit_ns))
 
     @property
     def late_ns(self) -> int:
-        """The call's present lateness in ns."""
+        """How late this call is now, in ns. The class defines lateness."""
         return int(clock.boottime_ns() - self._due_ns)
 
     def excuse(self, late_ns: int) -> None:
-        """Subtract this time from the lateness. Otherwise the small delays of a long ramp would add up."""
+        """Do not count this time as lateness of the call. The small delays of a long ramp would add up."""
         self._due_ns += late_ns
 
     @contextmanager

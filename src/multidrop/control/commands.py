@@ -34,10 +34,10 @@ COMMAND_S = 60.0  # a command that takes longer is reported as hanging (a stop m
 TURN_S = 0.2  # s; how long each stop may block the event loop, if no thread can be started
 AGAIN_S = 0.2  # s; pause between two stops in the event loop, so that its other work runs
 STOP_S = 30.0  # s; how long the event loop repeats stops, if no thread can be started
-# s; a drive's stop is repeated for at least this long after a client's newest call of a stop
+# Seconds. After a client's stop command, an unconfirmed stop is repeated for at least this time.
 REPEATED_S = 30.0
 MOST_STOPS = 8  # limit of concurrent stops of one drive that arrive over one interface
-JOIN_S = 0.5  # s; stops above that limit are joined for this long, and then sent as one stop
+JOIN_S = 0.5  # s; delay of the one stop that replaces all stops above MOST_STOPS
 BEGINNING_S = 0.25  # s; longest time from the call of a stop until `stops_under_way` lists it
 
 R = TypeVar("R")
@@ -78,7 +78,7 @@ def write_register(drive: Drive, name: str, value: float | str) -> CommandResult
 
 
 def typed_value(register: Register[Any], value: float | str) -> Any:
-    """Convert a value to the register's type. Raises ValueError if the number of a choice is not whole."""
+    """Convert a value to the register's type. Raises ValueError if a choice's raw count is not whole."""
     if isinstance(value, str):
         return register.parse(value)
     if register.values is None:
@@ -218,8 +218,9 @@ class RepeatedStops:
         self._begin = begin
         # each drive's newest repeated stop, and when that stop was called
         self._repeated: dict[Drive, tuple[StopFuture, float]] = {}
-        self._sent: dict[Drive, StopFuture] = {}  # each drive's single stop that is in flight
-        # each drive's single stop that will be sent after the one in flight
+        # `send_once` sends an extra stop: a stop that is not repeated.
+        self._sent: dict[Drive, StopFuture] = {}  # extra stops in flight, by drive
+        # extra stops that wait for the one in flight, by drive
         self._waiting: dict[Drive, StopFuture] = {}
         self._tasks: set[StopFuture] = set()
 
@@ -245,15 +246,15 @@ class RepeatedStops:
             self.note(drives, future)
         return [*begun, *(self.send_once(drive) for drive in once)]
 
-    def note(self, drives: Iterable[Drive], stops: StopFuture) -> None:
-        """Record that `stops` is repeating the stops of these drives."""
+    def note(self, drives: Iterable[Drive], future: StopFuture) -> None:
+        """Record the future of a stop that is being repeated for these drives."""
         self._repeated = {drive: one for drive, one in self._repeated.items() if not one[0].done()}
-        self._repeated |= dict.fromkeys(drives, (stops, _now()))
+        self._repeated |= dict.fromkeys(drives, (future, _now()))
 
     def of(self, drive: Drive) -> StopFuture | None:
-        """Return the future of the repeated stop of this drive; None if no stop is being repeated.
+        """Return the future of the stop that is being repeated for this drive; None if there is none.
 
-        Also return None if this drive's stop is over while the stop of its whole line continues.
+        If that future stops a whole line, this drive's own stop may be over first. Then return None.
         """
         stops, called = self._repeated.get(drive, (None, 0.0))
         if stops is None or stops.done():
@@ -269,7 +270,7 @@ class RepeatedStops:
         return [drive for drive in drives if drive not in again], again
 
     def send_once(self, drive: Drive) -> StopFuture:
-        """Send a single stop to a drive whose stop is already being repeated.
+        """Send one extra stop to a drive whose stop is already being repeated.
 
         Return a future for the result of the repeated stop. If the repeated stop gives up less than
         REPEATED_S after this call, another one is started.
@@ -322,13 +323,13 @@ def _now() -> float:
 class JoinedStops:
     """Starts the stops that arrive over one interface, so that a flood of stops delays no other stop.
 
-    While MOST_STOPS stops of the same drives are in progress, further ones are joined: JOIN_S later, one stop
-    is started for all of them.
+    While MOST_STOPS stops of the same drives are in progress, further ones wait for JOIN_S seconds. Then one
+    stop is started for all of them.
     """
 
     def __init__(self) -> None:
-        self._running: Counter[object] = Counter()  # number of unfinished stops of the same drives
-        self._joined: dict[object, asyncio.Future[Any]] = {}  # stops that are started after JOIN_S
+        self._running: Counter[object] = Counter()  # numbers of unfinished stops, by the drives to stop
+        self._joined: dict[object, asyncio.Future[Any]] = {}  # waiting stops, by the drives to stop
 
     def begin(self, drives: object, start: Callable[[], asyncio.Future[R]]) -> asyncio.Future[R]:
         """Start a stop, and return its future; several joined stops have the same future.

@@ -201,7 +201,7 @@ class ExitHook:
         """If no exit task is left, restore the earlier handlers. Does nothing outside the main thread."""
         if not self._tasks and self._held is None and threading.current_thread() is threading.main_thread():
             self._let_go()
-            if self._tasks:  # another thread has added an task
+            if self._tasks:  # another thread has added a task
                 self.take_signals()
 
     def _at_exit(self) -> None:

@@ -35,7 +35,7 @@ Timed = Callable[[], AbstractContextManager[None]]
 
 
 class Suspicion(NamedTuple):
-    """Why a drive may be of another family, and the make that it seems to be, if known."""
+    """Why a drive may not be of its declared family. `make` is the make that it seems to be, if known."""
 
     why: str
     is_certain: bool = False
@@ -61,10 +61,10 @@ class EchoCheck:
                 self._exchanges.values(drive, [register], attempts, insists=insists, timeout=timeout)
 
     def probe(self, drive: Drive, *, insists: bool = False) -> None:
-        """Read a register once, to learn whether the adapter echoes requests.
+        """Read a register once, to find out whether the adapter echoes requests.
 
-        A request that another client sends may look like our echo. Without this read, later confirmations of
-        writes, which are copies of their requests, would be ignored as echoes.
+        A request of another client can look like an echo of our own. The core would then ignore the drive's
+        confirmations of writes, because they are copies of our requests. A reply to this read prevents that.
         """
         with suppress(*READ_FAILURES):
             self.read_any(drive, 1, insists=insists, timeout=WRITE_TIMEOUT)
@@ -106,7 +106,7 @@ class _Findings:
         self.port = port  # the open port's object; reopening creates another one
         self.confirmed: _Confirmed | None = None
         self.stops: set[float] = set()  # raw counts that `check_before_stop` has allowed
-        self.suspicion: Suspicion | None = None  # the suspicion of the previous check before a stop
+        self.suspicion: Suspicion | None = None  # result of the previous check before a stop
         self.doubt = ""  # why the drive seemed to be of another family when a stop was sent
 
 
@@ -162,7 +162,8 @@ class IdentityCheck:
             make = self._shown(drive, _of_same_register(drive), timed)
             if make is None:
                 raise
-            raise WriteForbidden(f"{refusal}; {_answers_like(make)}", rule=refusal.rule) from refusal
+            why = f"{refusal}; it answers as {_described(make)}"
+            raise WriteForbidden(why, rule=refusal.rule) from refusal
         except DriveException as refusal:
             kind = drive.title or type(drive).__name__
             raise WriteForbidden(
@@ -189,7 +190,7 @@ class IdentityCheck:
             before = peer.silences
             make = self._shown(drive, makes, timed)
             if make is not None:
-                why = f"nothing is written to {drive.name}: {_answers_like(make)}"
+                why = f"nothing is written to {drive.name}: it answers as {_described(make)}"
                 raise WriteForbidden(why, rule="it shows another make")
             if peer.silences == before:
                 break
@@ -233,7 +234,7 @@ class IdentityCheck:
         rivals = run_by(register, count)
         suspicion = self._suspicion(drive, rivals) if self._is_in_step(drive) else None
         before, findings.suspicion = findings.suspicion, None
-        # a suspicion that names a make is already the result of SURE checks
+        # `make` is set only after SURE checks in a row, so no other check is needed
         if suspicion is not None and suspicion.make is not None:
             raise _withheld(drive, suspicion.why, suspicion.make)
         if suspicion is not None and before is None:
@@ -244,14 +245,14 @@ class IdentityCheck:
                 drive, self._while_in_step(drive, rivals)
             )
             if other is not None or suspicion.is_certain:
-                # the result is not kept: the next stop checks the drive again
+                # not added to `findings.stops`, so the next stop checks the drive again
                 raise _withheld(drive, suspicion.why, other)
         if suspicion is not None:
             findings.doubt = suspicion.why
         findings.stops.add(count)
 
     def doubt(self, drive: Drive) -> str:
-        """Return the suspicion in spite of which a stop was sent to the drive; "" if there was none."""
+        """Return why the drive may be of another family although a stop was sent to it; "" if no reason."""
         findings = self._findings(drive)
         return "" if findings.confirmed else findings.doubt
 
@@ -293,7 +294,6 @@ class IdentityCheck:
         except Exception:  # no reply, or an error in the family's own code: the stop is sent
             return self._rival(drive, rivals)
         if self._is_in_step(drive):
-            # `_suspicion` is called only for drives whose family is not confirmed
             self._know(drive, findings, silences, was_heard=False)
         return None
 
@@ -301,12 +301,13 @@ class IdentityCheck:
         """Return a suspicion if `identify` cannot exclude these makes and the drive answers like one."""
         makes = self._while_in_step(drive, rivals)
         make = self._shown(drive, makes) if drive.identity_is_weak else None
-        return None if make is None else Suspicion(_answers_like(make), make=make)
+        return None if make is None else Suspicion(f"it answers as {_described(make)}", make=make)
 
     def _shown(self, drive: Drive, makes: Iterable[Make], timed: Timed = nullcontext) -> Make | None:
-        """Return the first of these makes that SURE checks of the drive's registers all show, or None.
+        """Check the drive's registers for each of these makes; return the first make that fits, or None.
 
-        After a missing reply, skip the makes that answer each request.
+        A make fits if SURE checks in a row show it. After a missing reply, makes that answer every request
+        are skipped.
         """
         try:
             probe = Evidence(
@@ -350,7 +351,7 @@ class IdentityCheck:
                 continue
             if _is_harmless_in(family, register, count):
                 continue
-            with suppress(ValueError):  # raised if no drive of `other` can be on this line
+            with suppress(ValueError):  # raised if this family does not allow the drive's line settings
                 other = family(
                     drive.address, framing=drive.framing, baudrate=settings.baudrate, format=settings.format
                 )
@@ -402,8 +403,8 @@ def _is_harmless_in(family: type[Drive], register: Register[Any], count: float) 
     )
 
 
-def _answers_like(make: Make) -> str:
-    return f"it answers as {_with_article(make.title)} does; if it is one, declare model {make.model}"
+def _described(make: Make) -> str:
+    return f"{_with_article(make.title)} does; if it is one, declare model {make.model}"
 
 
 def _with_article(title: str) -> str:

@@ -94,7 +94,8 @@ class Stopped:
     def ok(self) -> bool:
         """True if the motor was seen to be at rest, or the device has no motor.
 
-        Also True if the script of a drive of your own reads nothing that shows whether the motor is at rest.
+        The stop script of your own drive class may read nothing after its last write. Its stop has the result
+        STOPPED once the drive has confirmed it, and `ok` is True.
         """
         return self.seen in (Seen.STOPPED, Seen.NO_MOTOR)
 

@@ -48,9 +48,9 @@ class Performer:
         self._expiry = expiry
 
     def call(self, drive: Drive, verb: str = "", seen: int | None = None) -> Call:
-        """Return a new call. It expires, and any later stop of the drive cancels it.
+        """Return the `Call` of a method that writes to the drive. A later stop of the drive cancels it.
 
-        For a call that started earlier, `seen` is the drive's number of stops at that time.
+        If the method was called earlier, `seen` is the number of the drive's stops at that time.
         """
         permit = self._latches.latch(drive).permit(seen)
         if self._latches.is_shut:
@@ -106,9 +106,10 @@ class Performer:
             return self._writer.raw(drive, request, call)
 
     def check_identity(self, drive: Drive, rest_s: float = 0.0) -> None:
-        """Check a drive's declared family, unless this was done before. Log its `watchdog` if it has a motor.
+        """Check that the drive is of its declared family, unless it was checked before.
 
-        `rest_s` is a pause in s before each read.
+        After the check, log what the motor does if this client dies. `rest_s` is a pause in s before each
+        read.
         """
         if not self._writer.identity_check.is_known(drive):
             self._look_at_identity(drive, self.call(drive), rest_s)
@@ -187,10 +188,10 @@ class Performer:
 
 
 def _check(step: Step, call: Call, cancelled: list[CancelledByStop]) -> None:
-    """Raise CancelledByStop after a stop. If the script catches this error and continues, raise _Over.
+    """Raise CancelledByStop if a stop was called; raise _Over if the script has caught this error before.
 
-    A verb's script ends at its next step, any other script at its next write. An `Insist` step is always
-    carried out, because it is harmless and undoes an earlier write.
+    A verb's script gets the error at its next step, any other script at its next write. An `Insist` step is
+    always carried out, because it is harmless and undoes an earlier write.
     """
     if isinstance(step, Insist) or not (call.verb or isinstance(step, Write)) or call.permit.is_good:
         return
@@ -336,7 +337,7 @@ class Broadcaster:
         return {drive.name: self._state(drive) for drive in drives}
 
     def _checked_call(self, drives: Sequence[Drive], what: str) -> Call:
-        """Check that each drive may be written; return a new call of the first drive, for the broadcast."""
+        """Check that each drive may be written; return the first drive's `Call` for the broadcast."""
         check_author()
         calls = [self._performer.call(drive) for drive in drives]
         for call in calls:

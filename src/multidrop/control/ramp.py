@@ -29,12 +29,12 @@ WAIT_SLACK_S, READ_S = 2.0, 5.0  # limits for one wait, and for the reads of one
 def start_staggered(drives: Sequence[Drive], gap: float, direction: Direction | None = None) -> None:
     """Start drives one after another, `gap` seconds apart.
 
-    If a start fails, stop that drive and all started before it, and raise the failure. If the failing drive's
-    identity is not confirmed and nothing was sent to it, it gets no stop, because the stop of its declared
-    family may start a drive of another family. A drive whose stop is called on any thread during this call
-    is not started. Drives that wait for their turn are read regularly: if a drive was silent, a setpoint that
-    cannot be read back is assumed lost. Raises Expired if a drive's turn comes late, because the computer
-    slept or the process was suspended.
+    If a start fails, stop that drive and all started before it, and raise the failure. The failing drive gets
+    no stop if its identity is not confirmed and nothing was sent to it: it may be of another family, which
+    the stop would start. A drive whose stop is called on any thread during this call is not started. Drives
+    that are not started yet are read regularly. After a silence, the setpoint of a drive that cannot report
+    it is assumed lost, and its start raises WriteForbidden. Raises Expired if a start comes late because the
+    computer slept or the process was suspended.
     """
     if not 0 <= gap < inf:
         raise ValueError(f"gap = {gap:g} s: it must be 0 or more")
@@ -66,8 +66,8 @@ def _is_safe_to_stop(drive: Drive, call: Call | None) -> bool:
 def _await_turn(waiting: Sequence[Drive], gap: float, unheard_s: float, call: Call | None) -> float:
     """Wait for `gap` seconds. Every HEARD_S seconds of the wait, read the drives in `waiting`.
 
-    `unheard_s` is the time in s since the drives' last read; return its new value after the wait. If the
-    process is suspended during the wait, the next start may expire: `call` counts that time as lateness.
+    `unheard_s` is the time in s since the drives' last read; return its new value after the wait. `call` is
+    the start of the next drive. It can expire if the process is suspended during the wait.
     """
 
     def planned(seconds: float) -> AbstractContextManager[None]:
@@ -88,10 +88,10 @@ def _await_turn(waiting: Sequence[Drive], gap: float, unheard_s: float, call: Ca
 
 
 def _stop(drives: Sequence[Drive]) -> None:
-    """Stop all drives, each on a thread, because they may be on several buses and one may be silent.
+    """Stop all drives, each on a thread of its own, because a silent drive must not delay the others.
 
-    If the system has no thread left, each of the remaining drives is sent one stop first, and then each is
-    stopped in turn. On an interruption the remaining drives are each sent a stop again.
+    If the system has no thread left, first send one stop to each remaining drive, without repetitions. Then
+    stop one drive after another. If Ctrl-C interrupts this, send each of them one more stop.
     """
 
     def stop(drive: Drive, seconds: float | None = None) -> None:
@@ -167,7 +167,7 @@ def checked_rate(drive: Drive, rate: float | None) -> Script[float]:
 
 
 def check_worn(drive: Drive, what: str) -> None:
-    """Raise WriteForbidden if the drive may store its setpoint in EEPROM, which `what` would wear out."""
+    """Raise WriteForbidden if the drive may store its setpoint in EEPROM; `what` describes the writes."""
     if wears(drive, drive.register(drive.setpoint_name)) is not Kept.RAM:
         raise WriteForbidden(
             f"the setpoint of {drive.name} may be kept in EEPROM, which {what} would wear out"

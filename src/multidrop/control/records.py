@@ -107,8 +107,9 @@ class Ledger:
         """Count a write that is about to be sent, and return "".
 
         If the write must not be sent, return the reason, and do not count the write. `now` is UTC in s;
-        `least_interval` is the shortest time in s between two writes. Check and count are one transaction, so
-        two processes cannot both use the last of the budget. Raises OSError if the file cannot be written.
+        `least_interval` is the shortest time in s between two writes. The file is locked until the write is
+        counted, so two processes cannot both take the last write of the budget. Raises OSError if the file
+        cannot be written.
         """
         with self._opened() as ledger:
             ledger.execute("begin immediate")

@@ -47,10 +47,10 @@ def raw_count(drive: Drive, register: Register[T], value: T) -> float:
 
 
 def check_known(drive: Drive, register: Register[Any], raw: float) -> None:
-    """Raise WriteForbidden if this write may command the motor and needs the drive's option `confirmed`.
+    """Raise WriteForbidden if this write needs the drive's option `confirmed` and the option is not set.
 
-    A stop does not need the option. If the drive's class is from a family file, all other writes need it,
-    even harmless ones.
+    A stop never needs the option. Writes that may command the motor need it. If the drive's class is from a
+    family file, all writes except stops need it.
     """
     is_unproven = bool(drive.declared_in) and "confirmed" in drive.options  # the family file may be wrong
     if is_harmless(register, raw):
@@ -63,7 +63,7 @@ def check_known(drive: Drive, register: Register[Any], raw: float) -> None:
 def check_plain(drive: Drive, register: Register[Any], raw: float) -> None:
     """Raise WriteForbidden for a write that may move the motor: only verbs such as `start` may send it.
 
-    Other writes are allowed, unless they need the drive's option `confirmed` (see `check_known`).
+    Any other write is checked by `check_known`.
     """
     if is_harmless(register, raw) or not register.commands:
         check_known(drive, register, raw)
@@ -90,13 +90,13 @@ def _has(drive: Drive, name: str) -> bool:
 
 
 def check_broadcast(drive: Drive, register: Register[Any], raw: float) -> None:
-    """Raise WriteForbidden if this is not a stop and the drive's option `confirmed` is needed."""
+    """Raise WriteForbidden unless this is a stop, or the drive needs no option `confirmed`, or has it set."""
     if not is_stop(drive, register, raw):
         drive.check_confirmed(register.name)
 
 
 def is_stop(drive: Drive, register: Register[Any], raw: float) -> bool:
-    """Return True if this write is a stop: it may be sent at any time, and the family has a verb `stop`."""
+    """Return True if this raw count is harmless at any time and the family has a verb `stop`."""
     return is_harmless(register, raw) and _has(drive, "stop")
 
 
@@ -141,7 +141,7 @@ def _must_stand(drive: Drive, register: Register[Any]) -> Script[None]:
 def _not_now(drive: Drive, register: Register[Any], rule: str) -> WriteForbidden:
     """Return the error for a rule that depends on the drive's state.
 
-    The error names the register's place in the manual, which may contain no such rule.
+    The manual may not contain the rule, so the error cites it only for the register.
     """
     where = f" (in the manual, {register.name} is {register.place})" if register.place else ""
     sentence = f"{register.name} of {drive.name} is not written: {rule}{where}"

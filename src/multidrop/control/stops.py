@@ -44,7 +44,7 @@ LOOK_S = 0.002  # s; pause between checks whether a poller has reopened a lost p
 AT_ONCE = 8  # after this many steps without a good reply, a stop shares the line with polling
 # After a step without a good reply, a stop leaves the line to polling for SHARE times the step's duration.
 SHARE = 1.5
-MOST_STEPS = 8  # limit of the steps when an interrupted stop is sent once more
+MOST_STEPS = 8  # limit of script steps when an interrupted stop is sent once more
 UNSENT = (WriteForbidden, LineError, NotMaster, ValueError)
 WORTH_REPEATING = (Unconfirmed, NotVerified, NoReply, BadReply, DriveException, PortLost, NotMaster)
 UNANSWERED = (Unconfirmed, NoReply, BadReply)
@@ -61,10 +61,10 @@ Do = Callable[["StopAttempt", Step], Any]
 class StopAttempt:
     """One drive's stop, repeated until the drive confirms it and the motor is seen to stop.
 
-    The stop is repeated for `seconds`. If `seconds` is None, the stop is repeated for LEAST_S, and a
-    repetition that started by then may last as long as the motor's ramp. After AT_ONCE steps without a good
-    reply, the stop leaves more than half of the line's time to polling and other stops. `ready` returns the
-    time (in s) before which no request may be sent to the drive.
+    The stop is repeated for `seconds`. If `seconds` is None, no repetition starts after LEAST_S, and the last
+    one may take as long as the motor's ramp. After AT_ONCE steps without a good reply, the stop uses less
+    than half of the line's time, and leaves the rest to other requests. `ready` returns the time (in s)
+    before which no request may be sent to the drive.
     """
 
     def __init__(
@@ -131,7 +131,7 @@ class StopAttempt:
             else:
                 begun = now()
                 is_answered = self._carry_out(step, do)
-                # not earlier than now, so that stops that are already overdue go first
+                # Without this, the next step could go ahead of stops that have waited longer.
                 self.due = max(self.due, now())
                 if not is_answered:
                     self._share_line(begun, now())
@@ -334,7 +334,7 @@ def _is_worth_repeating(failure: Exception) -> bool:
 
 
 class StopRun:
-    """The stops of one or several drives that one call carries out.
+    """Stops one or several drives for one call, such as `stop_all`.
 
     The caller repeats `carry_out` after MemoryError or OSError, and calls `interrupted` after other failures.
     """
@@ -501,7 +501,7 @@ class Stopper:
 
         try:
             return self._on_open_port(write)
-        except CheckAgain:  # no other drive must be stopped before the second check
+        except CheckAgain:  # repeated at once, because this call stops no other drive
             return self._on_open_port(write)
 
     def ready(self, drive: Drive) -> float:
@@ -572,7 +572,10 @@ def _limit(seconds: float | None) -> float | None:
 
 
 def stop_together(stops: Sequence[StopAttempt], do: Do, end: Callable[[StopAttempt], object]) -> None:
-    """Carry out the steps of all stops as they become due; call `end(stop)` once or more when it is over."""
+    """Carry out the steps of all stops as they become due; call `end(stop)` after the last step of a stop.
+
+    An interruption by a signal may cause a second call of `end` for the same stop.
+    """
     waiting = [stop for stop in stops if not stop.is_over]
     while waiting:
         stop = min(waiting, key=_due)  # the stop that is due first

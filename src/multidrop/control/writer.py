@@ -35,7 +35,7 @@ from multidrop.transport.exchange import READ_FAILURES, Exchanges, good_reply
 
 ACKNOWLEDGED = 5  # exception code: the device accepted the request, but needs more time
 
-# Writes (register name, raw count) of one stop that `check_before_stop` has allowed
+# (register name, raw count) of each write that `check_before_stop` has allowed for one stop
 Checked = set[tuple[str, float]]
 
 
@@ -51,8 +51,9 @@ class Writer:
     # ---- writing ----
 
     def put(self, drive: Drive, step: Write, call: Call) -> Outcome:
-        """Check all rules except `check_plain`, and write once; return the outcome.
+        """Check a write, send it once, and return its outcome.
 
+        Verbs call this too, so it does not check whether the write may move the motor.
         Raises CancelledByStop or Expired if the write was not sent.
         """
         check_author()
@@ -161,7 +162,7 @@ class Writer:
         return reply.data
 
     def broadcast(self, drive: Drive, register: Register[Any], raw: float, call: Call | None = None) -> None:
-        """Broadcast a write of one of this drive's registers. `call` is None for a stop."""
+        """Broadcast a write of one of this drive's registers. A stop has no `Call` object."""
         request = write_request(drive, register, raw, address=0)
         what = _in_words(register, register.decode(raw))
         if call:
@@ -186,7 +187,7 @@ class Writer:
         timeout: float,
         log: Callable[..., None],
     ) -> Outcome:
-        """Send a write once; return its outcome. `call` is None for a stop."""
+        """Send a write once; return its outcome. A stop has no `Call` object."""
         request, asked = write_request(drive, register, raw), register.decode(raw)
         what = _in_words(register, asked)
         is_setpoint = register.name == drive.setpoint_name
@@ -271,7 +272,7 @@ class Writer:
             return None, failure
 
     def _look(self, drive: Drive, step: Step, call: Call) -> Any:
-        """Carry out a step of `conditions`: wait, or read a register and return its value."""
+        """Carry out one step of a script that only waits and reads; return the value that it reads."""
         if isinstance(step, Wait):
             with call.step(step.seconds):
                 return clock.sleep(step.seconds)
