@@ -154,7 +154,7 @@ def test_captures_of_wireshark_s_tools_are_read(tmp_path: Path, format: str, lin
     assert [span.time_ns for span in found] == [first + n * 10**6 for n in range(len(frames))]
 
 
-def test_frames_split_over_packets_and_several_in_one_packet_are_read(tmp_path: Path) -> None:
+def test_frames_are_read_even_if_packets_end_within_them(tmp_path: Path) -> None:
     frames = b"".join(each.request_frame + each.frame for each in RTU)
     packets = [frames[at : at + 7] for at in range(0, len(frames), 7)]
     header = struct.pack(">IHHiIII", 0xA1B23C4D, 2, 4, 0, 0, 65535, 147)  # big-endian, ns

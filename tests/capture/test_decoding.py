@@ -35,7 +35,8 @@ def plant(directory: Path, model: str, framing: str) -> Plant:
     return load_plant(path)
 
 
-EXCHANGES = [  # model, framing, request and reply as printed in manuals, register and value
+# model, framing, request as printed in the manual, register, value in the request or its reply
+EXCHANGES = [
     ("innovert-ibd", "rtu", "01 06 20 01 13 88 DE 9C", "frequency", 50),
     ("innovert-ibd", "rtu", "01 06 00 6B 00 C8 F9 80", "acceleration_time", 20),
     ("innovert-ibd", "ascii", "0106200113883D", "frequency", 50),
@@ -63,7 +64,7 @@ def _text(frame: bytes) -> str:
     return frame.decode().replace("\r\n", "\\r\\n") if frame[:1] == b":" else frame.hex(" ").upper()
 
 
-def test_each_register_of_a_captured_block_read_has_its_own_row(tmp_path: Path) -> None:
+def test_each_register_of_a_captured_block_write_has_its_own_row(tmp_path: Path) -> None:
     exchange = next(
         each for each in RTU if _text(each.request_frame) == "01 10 00 0C 00 02 04 00 C8 01 90 73 F8"
     )
@@ -139,7 +140,8 @@ def test_requests_beyond_the_decoders_cache_size_are_decoded_too(
     asked = [Message(1 + number % 2, 3, number // 2, 1) for number in range(13_000)]
     replies = (Message(each.address, 3, each.start, 1, data) if data else None for each in asked)
     path = frames_of(tmp_path / "a.pcapng", zip(asked, replies, strict=True))
-    told = asked if data else asked[:-1]  # the last request has no row, because its reply may still come
+    # if no request was answered, the last one has no row yet, because its reply may still come
+    told = asked if data else asked[:-1]
     assert [(row.drive, row.register, row.value, row.status) for row in rows(path)] == [
         (f"address {record.address}", f"holding_register_{record.start}", *end) for record in told
     ]

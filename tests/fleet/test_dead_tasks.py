@@ -54,7 +54,8 @@ MEMBER = (
     *(f"records {at}" for at in range(1, 1 + len(names.BUCKETS))),
     *("guard", "leaders", "weak session", "releases", "steps", "lines"),
 )
-TRIED = ("forwarder", "member", "gw-1: lease 1", "gw-1: lines")  # tasks that short test runs kill too
+TRIED = ("forwarder", "member", "gw-1: lease 1", "gw-1: lines")  # tasks killed in a short test run
+# tasks killed in a long test run
 TASKS = ("forwarder", "samples path", "member", "look", *(f"gw-1: {name}" for name in MEMBER))
 THREADS = ("multidrop spool", "multidrop poller", "multidrop batches")
 

@@ -28,7 +28,7 @@ from fleet_drills import (
 
 pytestmark = [pytest.mark.slow, pytest.mark.long]
 
-# one drill of each kind, except suspended gateways, which have their own test
+# one failure of each kind; a suspended gateway has its own test
 DONE = (
     "gateway killed",
     "gateway and node killed",
@@ -59,7 +59,7 @@ def is_drained(drill: FleetDrill, name: str) -> bool:
     return f"{name} has 0 lines left" in drill.run("drain", name).stdout
 
 
-def test_a_drained_gateway_releases_all_its_lines_and_ends_at_a_signal(drill: FleetDrill) -> None:
+def test_a_gateway_can_give_up_all_lines_and_then_exit_on_a_signal(drill: FleetDrill) -> None:
     """A service manager sends SIGTERM, and a closed terminal sends SIGHUP."""
     drill.settle()
     for name, number in (("gw-b", signal.SIGTERM), ("gw-c", signal.SIGHUP)):

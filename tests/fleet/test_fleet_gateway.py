@@ -180,7 +180,7 @@ async def test_the_gateway_closes_its_other_parts_after_one_part_fails_to_close(
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_a_gateway_shuts_down_in_order_without_servers(tmp_path: Path) -> None:
+def test_a_gateway_exits_without_error_after_all_servers_have_failed(tmp_path: Path) -> None:
     words = [sys.executable, "-m", "multidrop", "fleet"]
     with cluster(tmp_path / "nats", 1) as one, closing(SerialHall(1)) as hall:
         environment = {**os.environ, "MULTIDROP_NATS": one.urls[0], "XDG_STATE_HOME": str(tmp_path)}
@@ -276,7 +276,7 @@ class Looks(FleetView):
             raise self.failure
 
 
-def test_a_view_older_than_5_s_makes_the_part_fleet_unhealthy() -> None:
+def test_the_fleet_page_is_unhealthy_if_its_data_is_older_than_5_s() -> None:
     now = [0.0]
     view = Looks(ServerPath([]))
     watch = FleetWatch(view, lambda: now[0])

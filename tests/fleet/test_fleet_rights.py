@@ -44,7 +44,8 @@ DEEDS = ("DELETE", "PURGE", "UPDATE", "MSG.DELETE", "SNAPSHOT", "PEER.REMOVE")
 CONSUMERS = ("CONSUMER.CREATE.{}", "CONSUMER.CREATE.{}.c.>", "CONSUMER.DURABLE.CREATE.{}.c")
 COMMANDS = ("cmd.line-1", "stop.line-1", "do.gw-b.run")
 
-FORBIDDEN = {  # subjects that each user may not use, besides those that no user may use
+# subjects that are forbidden for one user; NOBODY has those that are forbidden for all users
+FORBIDDEN = {
     "gw-a": (
         *("samples.gw-b.log", "samples.gw-c.log", "samples.gw-a"),
         *("$KV.lease_0.gw-b.gw-b", "$KV.lease_1.gw-b.gw-c", "$KV.lease_2.gw-a.gw-b", "$KV.lease_0.gw-b"),

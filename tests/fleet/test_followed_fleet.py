@@ -112,7 +112,7 @@ def test_samples_get_monotonic_times_of_the_computer_that_shows_them() -> None:
     for at, (moment, monotonic, drive, register, value) in enumerate(
         zip(columns.time, columns.monotonic_ns, columns.drive, columns.register, columns.value, strict=True)
     ):
-        # number of the second exchange of this drive in the message
+        # The message has exchanges 0 to 7 with four drives, two with each. Only the second one is shown.
         number = 4 + int(columns.drives[drive][5:]) - 1
         assert moment == NOON + number * 10_000_000
         assert monotonic == 1000 * S + number * 10_000_000

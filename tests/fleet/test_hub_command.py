@@ -159,7 +159,7 @@ def test_an_unreachable_server_is_reported_in_one_sentence(
     assert told.count("\n") == 1
 
 
-def test_the_hubs_servers_may_come_from_the_environment(
+def test_the_hub_takes_server_addresses_from_the_environment(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ports = free_ports(2)
@@ -212,7 +212,7 @@ def test_a_missing_stream_is_reported(tmp_path: Path, capsys: pytest.CaptureFixt
 
 
 HOUR = 360_000  # number of exchanges in an hour; there is one per STEP
-FILES, EXCHANGES = 12, 10  # four files per hour
+FILES, EXCHANGES = 12, 10  # number of files, four for each hour, and of exchanges in each file
 
 
 @pytest.fixture

@@ -286,9 +286,11 @@ class PathState(NamedTuple):
     request: int | None = None  # age of the renewal that is on its way to the server
     ack: int | None = None  # age of the renewal whose acknowledgement is on its way back
     renewed: int | None = 0  # age of the newest renewal whose success the holder knows
-    # the record that the taker has read: whether it is still the newest, and how long ago it was first read
+    # The revision that the other gateway has read: True if it is still the newest one, and the time since the
+    # gateway first read it.
     seen: tuple[bool, int] | None = None
-    # a write in flight that ends this record; True if it would replace the newest revision
+    # The other gateway's write that ends the session, on its way to the server. False: the server will refuse
+    # it, because the record has a newer revision.
     ending: bool | None = None
 
 
@@ -356,7 +358,7 @@ class LeaseModel:
         """Return a representative of all states with the same future."""
         if not self.has_cas:
             return path
-        # a gateway cannot end a record that was renewed after the gateway had read it
+        # an outdated reading counts as none, because the server would refuse a write that is based on it
         seen = path.seen if path.seen and path.seen[0] else None
         request = path.request if path.ended is None else None
         return path._replace(seen=seen, request=request, ending=path.ending or None)
@@ -402,7 +404,8 @@ class LeaseModel:
         if not self.is_killed(table, later):
             yield (has_looked, *later)
         if has_looked:
-            yield (False, *numbers)  # the holder sends a request to a drive
+            # the master, which has checked the clock, sends a request to a drive
+            yield (False, *numbers)
         elif lease_rules.may_send(0, table.deadline(numbers)):
             yield (True, *numbers)
         for place, number in enumerate(numbers):
@@ -483,7 +486,7 @@ LARGE = ("deadline from the acknowledgement", "guard shorter than the timer's la
     "mutation",
     [pytest.param(name, marks=pytest.mark.long if name in LARGE else ()) for name in LEASE_MUTATIONS],
 )
-def test_the_model_finds_two_masters_if_a_lease_rule_is_changed(mutation: str) -> None:
+def test_the_state_model_finds_two_masters_if_a_lease_rule_is_changed(mutation: str) -> None:
     _, wrong = LEASE_MUTATIONS[mutation].search(most=500_000)
     assert wrong is not None
 

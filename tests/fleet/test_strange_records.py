@@ -145,7 +145,7 @@ async def test_a_gateway_survives_invalid_records(one: Cluster, monkeypatch: pyt
         await strew(path, "-again")
         await asyncio.wait([task], timeout=1.0)
         await until_polled(is_first=True)
-        # these records belong to the gateway itself, so only its session ends
+        # Two of the gateway's own lease records become invalid. Its session ends, and it starts a new one.
         for bucket in names.LEASES[:2]:
             await path.request(f"$KV.{bucket}.gw-a.rogue", b"{")
         await until_polled(is_first=False)
@@ -307,7 +307,9 @@ async def test_an_invalid_answer_of_a_server_raises_a_fleet_error(name: str) -> 
 
 
 @pytest.mark.parametrize("name", CLUSTERS)
-async def test_an_invalid_cluster_state_moves_no_leader(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_an_invalid_answer_about_servers_changes_no_leader(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Exceptions would end the gateway's tasks that read the states of clusters."""
     monkeypatch.setattr(setup, "WAIT_S", 0.0)  # the test does not wait for an election
     path: Any = Liar(CLUSTERS[name])

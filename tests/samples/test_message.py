@@ -263,7 +263,9 @@ def test_a_message_of_huge_size_is_not_unpacked(compression: str, most_allocated
 
 @pytest.mark.slow
 @pytest.mark.parametrize("column", OF_ONE_TEXT)
-def test_columns_that_would_grow_huge_are_rejected(column: str, most_allocated: Callable[[], int]) -> None:
+def test_a_column_that_repeats_one_long_text_is_not_unpacked(
+    column: str, most_allocated: Callable[[], int]
+) -> None:
     rows = 30_000
     columns = alike(rows)
     data = written(ZSTD, **(columns | {column: OF_ONE_TEXT[column](rows)}))
@@ -273,7 +275,7 @@ def test_columns_that_would_grow_huge_are_rejected(column: str, most_allocated: 
     assert most_allocated() - before < 8 << 20
 
 
-def test_the_limit_of_rows_applies_to_columns_that_need_no_bytes(most_allocated: Callable[[], int]) -> None:
+def test_a_billion_empty_rows_are_rejected_without_much_memory(most_allocated: Callable[[], int]) -> None:
     schema = pa.schema([("time", pa.null())])
     rows = pa.RecordBatch.from_arrays([pa.Array.from_buffers(pa.null(), 1 << 30, [None])], schema=schema)
     sink = pa.BufferOutputStream()

@@ -200,7 +200,7 @@ def test_a_killed_process_loses_no_row_that_it_reported(folder: Path, kills: int
         here = {**os.environ, "PYTHONPATH": support}
         with BoundProcess(words, stdout=subprocess.PIPE, text=True, env=here) as child:
             child.stdout.readline()
-            # the child's second report: more than 0 rows are on the disk
+            # the child reports again and again how many rows are on the disk; the second number is above 0
             least = int(child.stdout.readline())
             time.sleep(dice.uniform(0, longest_s))
             child.kill()
@@ -237,7 +237,7 @@ def test_a_full_spool_removes_its_oldest_messages(folder: Path, caplog: pytest.L
 
 
 @pytest.mark.parametrize(("most", "sent", "lost"), [(1000, 2, 4), (4, 4, 2), (4, 3, 6)])
-def test_rows_removed_while_the_streams_position_is_unknown_are_counted_later(
+def test_removed_rows_are_counted_as_lost_at_the_next_acknowledgement(
     folder: Path, monkeypatch: pytest.MonkeyPatch, most: int, sent: int, lost: int
 ) -> None:
     """If more messages are removed than the spool remembers, it counts whole ranges of messages as lost."""

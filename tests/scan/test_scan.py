@@ -173,7 +173,7 @@ def test_sweep_of_a_line_without_drives_takes_the_predicted_time(format: str) ->
     assert line.seconds <= 1.02 * sum(sweep.needed for sweep in plan)
 
 
-def test_needed_time_of_a_sweep_sums_silences_requests_and_timeouts() -> None:
+def test_the_duration_of_a_sweep_includes_silences_requests_and_timeouts() -> None:
     (sweep, patient) = sweeps([InvtCHE], addresses=[1, 2], baudrates=[9600], formats=["8N1"])
     character = 10 / 9600
     each = 3.5 * character + 1 / 9600 + 8 * character
@@ -498,7 +498,9 @@ def test_port_that_supports_no_setting_raises_line_error() -> None:
         ),
     ],
 )
-def test_settings_that_no_family_has_raise_value_error(asked: dict[str, list[object]], sentence: str) -> None:
+def test_a_setting_outside_all_families_raises_value_error(
+    asked: dict[str, list[object]], sentence: str
+) -> None:
     with pytest.raises(ValueError, match=sentence):
         sweeps(FAMILIES, **asked)
 

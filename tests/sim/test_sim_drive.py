@@ -261,7 +261,7 @@ def test_encoded_number_is_made_of_address_table_and_register(register: Register
     assert int.from_bytes(reply.data) == expected & width
 
 
-def test_encoded_drive_confirms_writes_and_keeps_its_values() -> None:
+def test_a_simulated_drive_with_fixed_values_confirms_writes_but_ignores_them() -> None:
     sim = EncodedDrive(Own(7))
     before = ask(sim, 3, 0x10, 1)
     request = Message(7, 6, 0x10, data=b"\x00\xc8")
@@ -269,7 +269,7 @@ def test_encoded_drive_confirms_writes_and_keeps_its_values() -> None:
     assert ask(sim, 3, 0x10, 1) == before
 
 
-def test_each_register_of_each_encoded_drive_has_a_different_number() -> None:
+def test_registers_of_simulated_drives_with_fixed_values_have_different_values() -> None:
     tables = (HOLDING, INPUT, Table("another", 7, None))
     codes = {encoded(address, table, at) for address in range(1, 9) for table in tables for at in range(8)}
     assert len(codes) == 8 * 3 * 8

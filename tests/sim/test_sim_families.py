@@ -143,7 +143,7 @@ def test_simulated_erman_ramps_the_motor_at_start_and_stop(erman: Bench) -> None
     erman.wait(60)
     assert erman.read(4, 0x400, 2) == [0, 1]
     assert erman.read(4, 0x01) == [285]
-    erman.exchange("01 05 00 01 FF 00 DD FA")  # stop; written by hand from the manual's tables
+    erman.exchange("01 05 00 01 FF 00 DD FA")  # stop (frame made by hand from the manual's tables)
     erman.wait(0.1)
     assert erman.read(4, 0x400, 2) == [0, 3]
     erman.wait(60)
@@ -163,13 +163,13 @@ def test_simulated_erman_ignores_a_start_while_the_stop_coil_is_on(erman: Bench)
 
 def test_simulated_erman_emergency_stop_prevents_a_start_until_a_reset(erman: Bench) -> None:
     erman.exchange("01 05 00 00 FF 00 8C 3A")
-    erman.exchange("01 05 00 02 FF 00 2D FA")  # emergency stop; written by hand from the manual's tables
+    erman.exchange("01 05 00 02 FF 00 2D FA")  # emergency stop (frame made by hand from the manual's tables)
     assert not erman.motor.energised
     assert erman.read(4, 0x402, 2) == [0, 1]
     erman.send(checksums.rtu("01 05 00 02 00 00"))
     erman.exchange("01 05 00 00 FF 00 8C 3A")
     assert not erman.motor.energised
-    erman.exchange("01 05 00 09 FF 00 5C 38")  # reset; written by hand from the manual's tables
+    erman.exchange("01 05 00 09 FF 00 5C 38")  # reset (frame made by hand from the manual's tables)
     assert not erman.motor.energised
     assert erman.read(4, 0x402, 2) == [0, 1]
     erman.exchange("01 05 00 00 FF 00 8C 3A")
@@ -381,14 +381,14 @@ def test_simulated_innovert_ibd_carries_out_a_broadcast_without_a_reply(ibd: Ben
     ibd.exchange("01 06 20 01 13 88 DE 9C")
     ibd.exchange("01 06 20 00 00 02 03 CB")
     ibd.wait(60)
-    assert ibd.exchange("00 06 20 00 00 01 42 1B") == ""  # stop; written by hand from the manual's tables
+    assert ibd.exchange("00 06 20 00 00 01 42 1B") == ""  # stop (frame made by hand from the manual's tables)
     ibd.wait(60)
     assert not ibd.motor.energised
 
 
 def test_delixis_forward_command_resets_a_fault_of_a_simulated_innovert_ibd(ibd: Bench) -> None:
     ibd.sim.trip(1)
-    ibd.exchange("01 06 20 00 00 10 83 C6")  # written by hand from the manual's tables
+    ibd.exchange("01 06 20 00 00 10 83 C6")  # frame made by hand from the manual's tables
     assert (ibd.motor.fault, ibd.motor.energised) == (0, False)
 
 
@@ -427,7 +427,7 @@ def test_simulated_delixi_obeys_the_line_only_if_its_parameters_select_it(delixi
 
 def test_simulated_delixi_reverse_command_turns_the_motor_in_reverse(delixi: Bench) -> None:
     delixi.exchange("01 06 00 02 13 88 25 5C")
-    delixi.exchange("01 06 20 00 00 22 02 13")  # written by hand from the manual's tables
+    delixi.exchange("01 06 20 00 00 22 02 13")  # frame made by hand from the manual's tables
     delixi.wait(60)
     assert delixi.motor.frequency == -50
 
@@ -452,14 +452,14 @@ def native() -> Bench:
 
 
 def test_simulated_delixi_native_frequency_and_run_state_are_read(native: Bench) -> None:
-    # written by hand from the manual's tables; state 1: stopped
+    # A frame made by hand from the manual's tables. State 1 means stopped.
     assert native.exchange(":010300000000000004")[:9] == ":01030001"
     native.exchange(":0104000100001388A1")
     native.exchange(":010200020000000005")
     native.wait(60)
     assert native.exchange(":010701F400000000FD") == ":010701F40000138898"
     assert native.exchange(":010300000000000004")[:9] == ":01030002"
-    native.exchange(":010200030000000006")  # reverse; written by hand from the manual's tables
+    native.exchange(":010200030000000006")  # reverse (frame made by hand from the manual's tables)
     native.wait(60)
     assert native.exchange(":010300000000000004")[:9] == ":01030003"
 
@@ -468,7 +468,7 @@ def test_simulated_delixi_native_frequency_and_run_state_are_read(native: Bench)
     ("fault", "shown", "state"),
     [(9, "00000009", 4), (10, "00000010", 4), (14, "00000014", 4), (7, "00000007", 5)],
 )
-def test_simulated_delixi_native_faults_show_the_printed_digits(
+def test_simulated_delixi_native_sends_fault_numbers_as_decimal_digits(
     native: Bench, fault: int, shown: str, state: int
 ) -> None:
     native.sim.trip(fault)
@@ -530,7 +530,7 @@ def test_simulated_delixi_native_refuses_parameter_writes_while_locked(native: B
     assert native.exchange(":0106000200001388A4") == ":0106000200001388A4"
 
 
-def test_simulated_delixi_native_refuses_commands_unless_the_line_is_selected(native: Bench) -> None:
+def test_simulated_delixi_native_refuses_run_commands_if_the_keypad_is_selected(native: Bench) -> None:
     native.sim["run_source"] = 0  # P00.00
     assert native.exchange(":010200020000000005") == ":01F0000000000000F1"
     assert not native.motor.energised
@@ -547,7 +547,7 @@ def test_simulated_delixi_native_carries_out_a_broadcast_without_a_reply(native:
     native.exchange(":0104000100001388A1")
     native.exchange(":010200020000000005")
     native.wait(60)
-    assert native.exchange(":000200010000000003") == ""  # stop; written by hand from the manual's tables
+    assert native.exchange(":000200010000000003") == ""  # stop (frame made by hand from the manual's tables)
     native.wait(60)
     assert not native.motor.energised
 
@@ -734,7 +734,7 @@ def test_simulated_yd1000_obeys_a_broadcast_setpoint_but_no_setting(yd: Bench) -
     assert (yd.sim["frequency"], yd.sim["acceleration_time"]) == (50, 10)
 
 
-def test_every_write_except_commands_wears_the_eeprom_of_a_simulated_yd1000(yd: Bench) -> None:
+def test_only_parameter_writes_wear_the_eeprom_of_a_simulated_yd1000(yd: Bench) -> None:
     yd.write(0x0009, 50)
     yd.write(0x1001, 5000)
     assert yd.sim.counters.eeprom_writes == {"acceleration_time": 1}
@@ -760,7 +760,7 @@ def test_simulated_yd1000_watchdog_trips_if_the_line_is_silent_too_long(yd: Benc
 
 
 # Write requests, which a drive confirms with a copy. The manuals do not print those of InvtCHE and YD1000,
-# which were written by hand from the manuals' tables.
+# which were made by hand from the manuals' tables.
 CONFIRMED = {
     "erman": (
         lambda: ErmanERG220(1),
@@ -821,7 +821,7 @@ def test_simulated_registers_are_readable_and_writable_as_declared(family: type[
 
 
 @table("family", [ErmanERG220, InvtCHE, InnovertIBD, DelixiModbus, DelixiNative, YD1000])
-def test_encoded_drive_of_every_family_is_read_with_its_numbers(family: type[Drive]) -> None:
+def test_a_simulated_drive_with_fixed_values_is_readable_in_every_family(family: type[Drive]) -> None:
     """Each register, read with whole frames, has the value that `encoded` or `known_counts` returns."""
     drive = family(5)
     known = drive.known_counts()

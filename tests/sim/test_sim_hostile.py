@@ -248,7 +248,7 @@ def read(line: Line) -> bytes:
     return found.raw
 
 
-def test_fault_hang_up_is_refused_for_a_pty_without_a_link() -> None:
+def test_simulated_hang_ups_are_refused_for_a_pty_without_a_link() -> None:
     with pytest.raises(ValueError, match=r"^line: a port that hangs up must be a link or a TCP port"):
         FaultyWire([simulated(Toy(1))], Faults(hang_up=0.1))
 
@@ -280,7 +280,7 @@ def test_all_mistakes_in_a_faults_file_are_reported_together(tmp_path: Path) -> 
     ]
 
 
-def test_drive_tables_of_a_faults_file_set_the_drives_faults(tmp_path: Path) -> None:
+def test_a_faults_file_can_describe_the_faults_of_single_drives(tmp_path: Path) -> None:
     path = tmp_path / "faults.toml"
     path.write_text('drop = 0.1\n[drive.pump-1]\nloss = 0.2\nsilence = "1 min"\n')
     pump = DriveFaults(loss=0.2, silence=60.0)

@@ -187,7 +187,7 @@ def test_simulated_drive_answers_a_valid_frame_after_garbage() -> None:
             assert exchange(fd, READ).data == expected()
 
 
-def test_simulated_drive_refuses_an_unknown_function_after_silence() -> None:
+def test_simulated_drive_refuses_a_request_with_an_unknown_function() -> None:
     with Simulator([Wire([simulated(ErmanERG220(1))])]) as sim, opened(sim.wires[0].path, 38400) as fd:
         os.write(fd, checksums.rtu("01 2B"))
         assert receive(fd, 5) == checksums.rtu("01 AB 01")

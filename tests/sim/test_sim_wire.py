@@ -50,7 +50,8 @@ def test_each_simulated_byte_arrives_at_its_last_bit_or_slightly_later(baudrate:
         passed += len(piece)
         ends = begin + passed * character
         assert at == pytest.approx(ends)  # the last byte of each chunk arrives at its last bit
-        # the first byte of each chunk arrives at most 1 ms or one character after its last bit
+        # A chunk arrives as a whole, so its first byte arrives late: at most 1 ms after the byte's last bit,
+        # or at most one character if that is longer.
         assert at - (ends - (len(piece) - 1) * character) <= max(1e-3, character) + 1e-9
     assert passed == 9
 
@@ -166,7 +167,7 @@ def test_late_simulated_reply_is_sent_before_the_next_reply() -> None:
     assert received == checksums.rtu("01 03 02 00 01") + checksums.rtu("02 03 02 00 02")
 
 
-def test_simulated_drives_with_two_framings_share_a_line() -> None:
+def test_simulated_drives_with_three_framings_share_a_line() -> None:
     rtu, text = Own(1, framing="rtu"), Own(2, framing="ascii")
     native = DelixiNative(3)
     wire = Wire([simulated(rtu), simulated(text), simulated(native)], unpaced=True)
@@ -201,7 +202,7 @@ def test_frame_is_discarded_if_the_baud_rate_changes_within_it() -> None:
     assert exchange(wire, READ, 0.002, 9600) != b""
 
 
-def test_all_simulated_drives_carry_out_a_broadcast_and_none_replies() -> None:
+def test_a_broadcast_changes_simulated_drives_of_its_framing_without_a_reply() -> None:
     sims = [
         simulated(Own(address, framing=framing))
         for address, framing in ((1, "rtu"), (2, "rtu"), (3, "ascii"))
@@ -223,7 +224,7 @@ def test_two_simulated_drives_with_the_same_address_are_refused() -> None:
         Wire([])
 
 
-def test_method_distort_of_a_simulated_wire_can_change_replies() -> None:
+def test_a_subclass_of_wire_can_change_simulated_replies() -> None:
     class Noisy(Wire):
         def distort(self, reply: bytes) -> bytes:
             return b"\x00" + reply

@@ -104,7 +104,7 @@ def test_error_for_a_port_that_cannot_be_opened_gives_the_reason(guest: Guest) -
 
 
 @pytest.mark.slow
-def test_a_16550_uart_has_the_drives_port_settings(guest: Guest) -> None:
+def test_a_16550_uart_accepts_the_port_settings_of_drives(guest: Guest) -> None:
     wanted = [(1200, "8N1"), (9600, "8E1"), (19200, "8O1"), (57600, "8E2"), (115200, "8N1"), (9600, "7E1")]
     for (baudrate, form), fact in zip(wanted, guest.run("uart", wanted=wanted), strict=True):
         assert fact == {"read": RIGHT, "kernel": [baudrate, form]}
@@ -169,7 +169,9 @@ DIVISOR_ACCESS, RTS, IS_EMPTY = 0x80, 2, 0x40  # bits of LINE_CONTROL, MODEM_CON
 
 def check_transceiver(registers: list[str], sending: int) -> None:
     """Check that RTS has the level `sending` from each request until the UART reports that it is empty."""
-    events = ""  # S: byte sent while RTS is `sending`; s: otherwise; e: UART is empty; -: RTS is set back
+    # S: a byte is sent while RTS has the level `sending`. s: a byte is sent while RTS has the other level.
+    # e: the UART reports that it is empty. -: RTS leaves the level `sending`.
+    events = ""
     line_control, rts = 0, None
     for access, register, text in UART_REGISTER.findall("\n".join(registers)):
         value = int(text, 16)
@@ -240,7 +242,7 @@ SIGNALS = [*((kind, signal.SIGINT) for kind in KINDS), *((kind, signal.SIGTERM) 
 @pytest.mark.slow
 @pytest.mark.long
 @USB
-def test_closing_a_stalled_port_discards_the_start_that_it_holds(guest: Guest, kind: str) -> None:
+def test_an_unsent_start_command_is_discarded_when_a_stalled_port_closes(guest: Guest, kind: str) -> None:
     """The driver of this adapter would wait for ever. `close` waits once, for less than a second."""
     found = guest.run("start_in_stall", kind=kind)
     assert len(found["waits"]) <= 1

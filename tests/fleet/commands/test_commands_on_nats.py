@@ -189,7 +189,7 @@ async def _lost(fleet: Fleet) -> None:
 
 
 @pytest.mark.parametrize("deed", [_moved, _moved_back, _died, _lost])
-def test_a_command_is_not_sent_if_its_line_moves_after_the_offer(
+def test_a_command_is_not_sent_if_its_line_changed_masters_before_confirmation(
     tell: Callable[[Story], None], deed: Callable[[Fleet], Awaitable[None]]
 ) -> None:
     async def story(fleet: Fleet) -> None:

@@ -73,7 +73,7 @@ async def test_a_command_is_logged_before_and_after_it_is_carried_out(desk: Desk
     assert (frame["by"], frame["way"]) == ("anna", "fleet")
 
 
-async def test_a_duplicated_confirmation_is_carried_out_once_with_one_answer(desk: Desks) -> None:
+async def test_a_command_that_is_confirmed_several_times_is_sent_once(desk: Desks) -> None:
     token = desk.offered()
     answers = await asyncio.gather(*(desk.do(token) for _ in range(5)))
     desk.clock.pass_s(100)
@@ -123,7 +123,7 @@ async def test_a_command_whose_thread_is_slow_is_not_sent_after_a_second(tmp_pat
         assert desk.writes == []
 
 
-async def test_a_stop_cancels_a_command_until_it_is_sent(desk: Desks) -> None:
+async def test_a_stop_cancels_a_confirmed_command_that_is_not_sent_yet(desk: Desks) -> None:
     """Right before it sends a command, the bus checks again whether a stop has cancelled the offer."""
     answer = await do_after(desk, lambda: desk.desk.offers.void(LINE, ["pump"], "a stop was called"))
     assert answer.outcome is NOT_SENT
@@ -173,8 +173,10 @@ MEANWHILE: dict[str, Callable[[Desks], object]] = {
 
 @pytest.mark.parametrize("deed", MEANWHILE)
 @pytest.mark.parametrize("is_late", [False, True])
-async def test_a_command_with_an_invalid_offer_is_not_sent(desk: Desks, deed: str, is_late: bool) -> None:
-    """The offer becomes invalid before it is confirmed, or between its confirmation and the write."""
+async def test_a_command_that_was_cancelled_before_its_write_is_not_sent(
+    desk: Desks, deed: str, is_late: bool
+) -> None:
+    """The command is cancelled before its sender confirms it, or between the confirmation and the write."""
     if is_late:
         answer = await while_noted(desk, lambda: MEANWHILE[deed](desk))
     else:
@@ -294,7 +296,7 @@ def test_a_stop_of_a_lost_line_has_no_answer(desk: Desks, monkeypatch: pytest.Mo
     assert desk.written == {"control"}
 
 
-async def test_a_stop_is_sent_once_despite_copies_and_cancels_offered_commands(desk: Desks) -> None:
+async def test_a_repeated_stop_message_causes_one_stop_and_cancels_waiting_commands(desk: Desks) -> None:
     token = desk.offered()
     copies = await asyncio.gather(*(desk.stop(id="one") for _ in range(3)))
     assert len({copy.text for copy in copies if copy}) == 1
@@ -506,7 +508,7 @@ def test_the_check_of_a_command_does_not_change_the_known_setpoint() -> None:
 
 
 @pytest.mark.long
-async def test_a_stop_that_waits_for_an_equal_stop_cancels_offered_commands_immediately(
+async def test_a_stop_that_joins_a_running_stop_cancels_waiting_commands_immediately(
     desk: Desks, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     begun, silent = list[str](), asyncio.Event()
@@ -648,4 +650,5 @@ def test_only_one_of_many_stops_is_repeated(monkeypatch: pytest.MonkeyPatch, tmp
     with desks(tmp_path) as desk:
         answers = asyncio.run(stopped(desk))
     assert [answer.outcome for answer in answers if answer] == [CommandOutcome.DONE] * 9
-    assert repeated == [None, 0.0, 0.0]  # three stops were sent: seven calls got the result of the last one
+    # Only three stops were sent. Seven of the nine calls share the third one.
+    assert repeated == [None, 0.0, 0.0]

@@ -387,7 +387,7 @@ def test_no_command_or_stop_is_sent_if_the_plant_cannot_be_read(tmp_path: Path, 
         asked(tmp_path, ScriptedPath(), what, Plant(FleetError("no server")))
 
 
-def test_commands_are_sent_with_an_older_copy_of_the_plant(tmp_path: Path) -> None:
+def test_a_client_uses_its_older_copy_of_the_plant_if_reading_fails(tmp_path: Path) -> None:
     plant = Plant()
     plant._failure = FleetError("no server")
     path = ScriptedPath(cmd=[OFFER], do=[IT_IS_DONE], stop=[IT_IS_DONE])

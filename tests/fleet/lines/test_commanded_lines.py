@@ -325,7 +325,7 @@ def test_no_row_is_lost_when_a_line_moves_between_gateways(tmp_path: Path, gatew
     assert [(one.lost, one.doubled) for one in judged] == [(0, 0), (0, 0)]
 
 
-def test_a_request_abandoned_when_polling_ends_has_a_row_with_that_status(
+def test_a_request_abandoned_at_the_end_of_polling_has_status_poll_ended(
     tmp_path: Path, gateways: list[Gateway], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("multidrop.polling.line_set.ENDING_NS", 0)

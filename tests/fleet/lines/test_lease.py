@@ -75,18 +75,19 @@ async def watched() -> tuple[Trial, Lease, Observer]:
     return trial, lease, observer
 
 
-async def test_a_new_lease_lasts_from_the_request_and_not_from_the_answer() -> None:
+async def test_a_new_lease_counts_from_the_sending_of_the_request() -> None:
     trial = Trial()
     for bucket in trial.buckets:
         bucket.before_put = lambda key: trial.clock.pass_s(0.25)  # the request takes 0.25 s
     lease, began = trial.lease(), trial.clock.now
     assert await lease.try_to_begin()
     assert lease.session == 1
+    # the lease needs two records; the second request was sent after 0.25 s
     assert lease.until <= began + 0.25 * SECOND + USUAL.lease
     assert trial.masterships[0].until == lease.until
 
 
-async def test_a_renewed_lease_counts_from_the_request_not_from_the_answer() -> None:
+async def test_a_renewed_lease_counts_from_the_sending_of_the_request() -> None:
     trial, lease = await begun()
     trial.clock.pass_s(1)
     sent = trial.clock.now
@@ -97,7 +98,7 @@ async def test_a_renewed_lease_counts_from_the_request_not_from_the_answer() -> 
     assert lease.until == trial.masterships[0].until == sent + USUAL.lease
 
 
-async def test_a_record_without_an_answer_extends_the_lease_after_its_next_renewal() -> None:
+async def test_a_lease_record_whose_write_got_no_answer_counts_after_its_renewal() -> None:
     """The answer to a request was lost, so the lease does not know which request wrote the lease record."""
     trial = Trial()
     trial.buckets[2].loses_answers = True
@@ -310,7 +311,7 @@ async def test_no_session_number_is_reused_even_if_lease_records_are_wrong() -> 
     assert after.session == newest + 1 > 4
 
 
-async def test_a_gateway_whose_name_is_in_use_waits_until_that_lease_expires() -> None:
+async def test_a_second_gateway_with_the_same_name_waits_until_the_first_lease_expires() -> None:
     trial, first = await begun()
     second = trial.lease()
     for _ in range(10):
@@ -399,7 +400,7 @@ async def test_a_released_lock_proves_a_process_dead(tmp_path: Path, monkeypatch
         ("this machine", "this machine", False),
     ],
 )
-async def test_another_lock_file_does_not_prove_that_the_previous_process_is_dead(
+async def test_a_new_or_copied_lock_file_does_not_prove_that_a_process_died(
     before: str, after: str, is_copied: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trial = Trial()
@@ -413,7 +414,9 @@ async def test_another_lock_file_does_not_prove_that_the_previous_process_is_dea
         assert not await trial.lease(lock=lock).try_to_begin()
 
 
-async def test_a_lock_of_another_boot_proves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_lock_of_another_boot_does_not_prove_that_a_process_died(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A copied disk has the same machine id, path and lock id, but not the same boot id of the kernel."""
     trial = Trial()
     machine, boot = tmp_path / "machine-id", tmp_path / "boot_id"
@@ -557,7 +560,7 @@ async def test_a_session_that_is_over_stays_over_after_an_outage() -> None:
     assert observer.sessions().keys() == {"a"}
 
 
-async def test_an_observer_doubts_the_end_of_a_session_that_was_written_during_an_outage() -> None:
+async def test_a_session_ended_during_an_outage_counts_as_alive_for_one_lease() -> None:
     """The gateway may have renewed its session, unseen, right before another gateway wrote the end."""
     trial, _lease, observer = await watched()
     await observer.end_the_dead()
@@ -571,14 +574,14 @@ async def test_an_observer_doubts_the_end_of_a_session_that_was_written_during_a
     assert observer.is_over("a", 1)
 
 
-async def test_look_returns_true_if_a_session_has_ended_or_may_be_ended() -> None:
+async def test_look_returns_true_if_a_session_has_ended_or_has_expired() -> None:
     trial, lease = await begun()
     observer = trial.observer()
     assert [await observer.look(path) for path in range(3)] == [False, False, False]
     await renew(lease)
     assert [await observer.look(path) for path in range(3)] == [False, False, False]
     trial.pass_lease()
-    # the end of a second lease record makes the session over
+    # the session has expired once two of its three lease records are found expired
     assert [await observer.look(path) for path in range(3)] == [False, True, True]
     await observer.end_the_dead()
     assert [await observer.look(path) for path in range(3)] == [False, False, False]
@@ -662,7 +665,7 @@ async def test_a_gateways_new_session_waits_if_another_gateway_ended_the_previou
     assert await second.try_to_begin()
 
 
-async def test_a_gateway_with_only_one_stale_lease_record_is_not_ended() -> None:
+async def test_a_session_with_only_one_expired_lease_record_is_not_ended() -> None:
     """If its stale record were ended, the gateway could not renew it for the rest of the session."""
     trial, lease = await begun()
     observer = trial.observer()
@@ -707,7 +710,7 @@ async def test_a_session_with_only_two_valid_lease_records_is_reported_as_weak()
     assert (lease.is_weak, observer.weak()) == (False, [])
 
 
-async def test_a_session_later_writes_the_lease_record_in_a_bucket_that_was_down() -> None:
+async def test_a_missing_lease_record_is_written_when_its_bucket_answers_again() -> None:
     trial = Trial()
     trial.buckets[2].is_down = True
     lease = trial.lease()
@@ -718,7 +721,7 @@ async def test_a_session_later_writes_the_lease_record_in_a_bucket_that_was_down
     assert lease.held[2] is not None
 
 
-async def test_a_session_replaces_a_record_of_a_dead_session_with_the_same_number() -> None:
+async def test_a_dead_sessions_record_with_an_equal_session_number_is_replaced() -> None:
     """Another process of this gateway left the record, and died before it had written a second record."""
     trial = Trial()
     trial.buckets[2].is_down = True
@@ -731,7 +734,7 @@ async def test_a_session_replaces_a_record_of_a_dead_session_with_the_same_numbe
     assert trial.values()[2]["nonce"] == trial.values()[0]["nonce"]
 
 
-async def test_a_session_is_weak_if_a_record_was_ended_before_its_write_was_confirmed() -> None:
+async def test_a_session_notices_that_its_unconfirmed_lease_record_was_ended() -> None:
     trial = Trial()
     trial.buckets[2].loses_answers = True
     lease = trial.lease()

@@ -172,7 +172,7 @@ async def test_lines_are_closed_half_a_second_before_the_lease_expires() -> None
     assert trial.lines.taken == set()
 
 
-async def test_tasks_that_wait_past_the_lease_open_no_line_and_write_no_record() -> None:
+async def test_tasks_that_are_delayed_until_the_lease_has_expired_do_nothing() -> None:
     trial = Trial()
     bucket = trial.buckets[0]
     writing = trial.keeper._owners._writing[bucket.name] = asyncio.Semaphore(0)
@@ -243,7 +243,8 @@ async def test_a_line_is_not_polled_while_its_release_may_be_stored() -> None:
     trial.keeper.reconcile()
     await trial.until_polled()
     assert owner_of(bucket.records["hall"]) == ("a", 1)
-    assert bucket.revision("hall") == 2  # the release at revision 1 can no longer be stored
+    # The delayed release would replace revision 1. The new record has revision 2, so the server refuses it.
+    assert bucket.revision("hall") == 2
 
 
 def owners(trial: Trial) -> list[tuple[str, int]]:
@@ -309,7 +310,7 @@ async def test_a_refused_claim_does_not_wait_for_a_late_answer(monkeypatch: pyte
     assert owners(trial) == [ME, ME, NOBODY]
 
 
-async def test_a_bucket_whose_home_server_may_have_failed_is_written_last() -> None:
+async def test_ownership_is_written_last_to_a_server_that_may_have_failed() -> None:
     trial = DeadTrial()
     await trial.read_and_begin()
     await trial.let_the_first_lag()
@@ -318,8 +319,8 @@ async def test_a_bucket_whose_home_server_may_have_failed_is_written_last() -> N
     assert owners(trial) == [NOBODY, ME, ME]
 
 
-async def test_buckets_are_written_in_the_usual_order_if_all_renewals_are_late() -> None:
-    """If all records are renewed late, the servers are busy, and no single home server has failed."""
+async def test_ownership_is_written_in_the_usual_order_if_all_servers_are_slow() -> None:
+    """If all lease records are renewed late, the servers are busy, and probably none has failed."""
     trial = DeadTrial()
     await trial.read_and_begin()
     trial.clock.pass_s(1.5)
@@ -345,7 +346,7 @@ async def test_a_claim_ends_although_the_server_of_its_bucket_has_failed(
     await asyncio.wait_for(trial.is_polled(), 10)
 
 
-async def test_a_claim_fails_if_another_gateway_has_written_a_record_first() -> None:
+async def test_a_claim_of_a_line_fails_if_another_gateway_was_faster() -> None:
     trial = DeadTrial()
     await trial.read_and_begin()
     trial.buckets[1].store("hall", owner_value(("b", 1), 2, 0))
@@ -400,7 +401,7 @@ async def test_a_late_answer_to_a_claim_does_not_undo_the_lines_release() -> Non
     assert trial.lines.taken == set()
 
 
-async def test_a_line_with_an_uncertain_release_is_claimed_only_if_claims_are_allowed() -> None:
+async def test_a_line_whose_release_got_no_answer_is_claimed_again_if_allowed() -> None:
     trial = await claimed()
     trial.are_down()
     trial.keeper.releasing = {"hall"}

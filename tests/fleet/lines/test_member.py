@@ -233,7 +233,7 @@ async def test_a_drained_gateway_releases_all_lines_and_claims_none(fleet: Clust
 
 @pytest.mark.slow
 @pytest.mark.long
-async def test_only_a_drained_gateway_releases_lines_while_a_server_is_silent(
+async def test_a_silent_server_delays_handovers_of_lines_except_after_fleet_drain(
     fleet: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     silent = Replica("n3", is_current=False, is_offline=True, active_ns=0)
@@ -442,7 +442,7 @@ def test_status_names_an_incompatible_gateway_until_its_session_ends(trial: Tria
     assert trial.trouble == ""
 
 
-def test_a_gateway_whose_lease_record_has_no_rules_version_is_incompatible(trial: Trial) -> None:
+def test_a_gateway_that_reports_no_version_of_its_rules_is_incompatible(trial: Trial) -> None:
     trial.begin("first", RULES)
     for bucket in trial.buckets:
         bucket.store(
@@ -529,7 +529,7 @@ async def test_a_gateway_whose_lease_expires_soon_ends_no_other_session(left_s: 
     clock = HandClock()
     member.lease.clock = clock
     member.lease.until = clock.now + 2 * SECOND
-    await member.step()  # the first step restarts the waiting times for all sessions
+    await member.step()  # at the first step, all other sessions count as just renewed
     asked: list[object] = []
 
     async def note(present: object) -> bool:

@@ -103,12 +103,12 @@ CASES = {
 
 
 @table("case", CASES)
-def test_claims_and_releases_follow_from_the_owners_in_the_records(case: str) -> None:
+def test_a_gateway_claims_and_releases_lines_according_to_their_records(case: str) -> None:
     found, wanted = CASES[case]
     assert found == wanted
 
 
-def test_a_line_is_not_claimed_before_its_first_record_was_read() -> None:
+def test_a_line_is_not_claimed_before_its_first_bucket_was_read() -> None:
     records = records_of(DEAD, DEAD, DEAD)
     records["first"] = None
     assert claim_of(ME, records, is_over) is None
@@ -123,7 +123,7 @@ def test_a_claim_writes_no_ownership_record_that_was_not_read() -> None:
     assert claim_of(ME, records, is_over) is None
 
 
-def test_a_claim_writes_last_in_a_bucket_that_may_have_no_leader() -> None:
+def test_a_bucket_that_may_have_no_leader_is_written_last() -> None:
     records = records_of(DEAD, DEAD, DEAD)
     assert claim_of(ME, records, is_over) == Claim({"first": 11, "second": 12}, {"third": 13}, 6)
     claim = claim_of(ME, records, is_over, leaderless=["first"])
@@ -133,7 +133,7 @@ def test_a_claim_writes_last_in_a_bucket_that_may_have_no_leader() -> None:
     assert claim == Claim({"second": 12, "first": 11}, {}, 6)
 
 
-def test_a_claim_after_an_uncertain_release_replaces_the_released_records() -> None:
+def test_a_claim_replaces_records_whose_release_got_no_answer() -> None:
     records = records_of(ME, ME, LIVING)
     assert claim_of(ME, records, is_over) is None
     assert claim_of(ME, records, is_over, ["second"]) == Claim({"second": 12}, {}, 6)
@@ -145,7 +145,7 @@ def owner_by_records(*owners: tuple[str, int] | None, alone: bool = False) -> tu
     return record and (record.value["gateway"], record.value["session"])
 
 
-def test_a_gateway_owns_a_line_only_with_two_votes_in_its_records() -> None:
+def test_a_line_has_an_owner_only_if_two_votes_agree() -> None:
     assert owner_by_records(LIVING, DEAD, LIVING) == LIVING
     assert owner_by_records(LIVING, NEVER, NEVER, alone=True) == LIVING
     assert owner_by_records(GIVEN, ME, GIVEN) == GIVEN
@@ -153,8 +153,8 @@ def test_a_gateway_owns_a_line_only_with_two_votes_in_its_records() -> None:
     assert owner_by_records(LIVING, NEVER, NEVER) is None
 
 
-def test_the_newer_owner_is_shown_if_two_owners_have_two_votes_each() -> None:
-    """A dead session has two votes in one old record: its bucket had no leader for a while."""
+def test_the_newer_of_two_owners_with_two_votes_is_shown() -> None:
+    """A dead session's old record with two votes is left, because its bucket had no leader for a while."""
     records = records_of(DEAD, ME, ME, alone=True)
     for bucket in ("second", "third"):
         records[bucket] = Record("x", 20, owner_value(ME, 6, 0))
@@ -184,10 +184,10 @@ def test_the_first_records_of_lines_are_spread_over_all_three_buckets() -> None:
     assert min(shares[bucket] for bucket in names.OWNERS) > len(lines) / 4
 
 
-# ---- a line is released only while other gateways can claim it, now and immediately afterwards ----
+# ---- a line is handed over only while other gateways can claim it, now and immediately afterwards ----
 
 
-# a line whose first record is in the bucket, by bucket
+# for each bucket, a line whose very first record is written into that bucket
 FIRST = {names.owner_buckets(line)[0]: line for line in (f"line-{at}" for at in range(30))}
 FIRST_LINES = set(FIRST.values())
 
@@ -217,7 +217,9 @@ class Releasing:
         asyncio.run(self.releases.look())
 
 
-def test_lines_are_not_released_until_two_buckets_have_a_leader(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lines_are_handed_over_only_while_two_nats_buckets_have_leaders(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     trial = Releasing(monkeypatch)
     trial.led = {"own_1"}
     assert trial.releases.due(FIRST_LINES) == set()
@@ -230,7 +232,7 @@ def test_lines_are_not_released_until_two_buckets_have_a_leader(monkeypatch: pyt
     assert trial.releases.due(FIRST_LINES) == {FIRST["own_1"], FIRST["own_2"]}
 
 
-def test_servers_are_checked_only_while_lines_wait_for_release(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_servers_are_checked_only_while_lines_wait_to_be_handed_over(monkeypatch: pytest.MonkeyPatch) -> None:
     trial = Releasing(monkeypatch)
     trial.look()
     assert trial.asked == []
@@ -243,7 +245,9 @@ def test_servers_are_checked_only_while_lines_wait_for_release(monkeypatch: pyte
     assert trial.releases.due(FIRST_LINES) == set()
 
 
-def test_no_line_is_released_while_two_buckets_have_a_silent_server(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_line_is_handed_over_while_servers_of_two_buckets_are_silent(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     trial = Releasing(monkeypatch)
     trial.maimed = {"own_0", "own_1"}
     trial.releases.due(FIRST_LINES)
@@ -255,7 +259,7 @@ def test_no_line_is_released_while_two_buckets_have_a_silent_server(monkeypatch:
     assert trial.releases.due(FIRST_LINES) == FIRST_LINES - {FIRST["own_1"]}
 
 
-def test_lines_are_released_after_a_server_was_silent_for_60_s(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lines_are_handed_over_after_a_server_was_silent_for_60_s(monkeypatch: pytest.MonkeyPatch) -> None:
     trial = Releasing(monkeypatch)
     trial.maimed = {"own_0", "own_1"}
     trial.releases.due(FIRST_LINES)
@@ -273,7 +277,7 @@ def test_lines_are_released_after_a_server_was_silent_for_60_s(monkeypatch: pyte
     assert trial.releases.due(FIRST_LINES) == set()
 
 
-def test_a_draining_gateway_does_not_wait_for_silent_servers(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_gateway_that_gives_up_all_lines_ignores_silent_servers(monkeypatch: pytest.MonkeyPatch) -> None:
     trial = Releasing(monkeypatch)
     trial.maimed = set(names.OWNERS)
     trial.led.remove("own_2")

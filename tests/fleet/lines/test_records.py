@@ -141,7 +141,7 @@ def moves_of(records: ShareRecords) -> list[tuple[str | None, str]]:
     return [(move.before, move.after) for move in records.moves.newest(9)]
 
 
-def test_a_move_names_the_former_master_if_two_ownership_records_named_it() -> None:
+def test_a_change_of_masters_is_seen_when_two_ownership_records_agree() -> None:
     records = followed()
     take(records, 1, owner_value(("b", 1), 1, 0, NEEDED), FIRST_BUCKET)
     assert moves_of(records) == [("", "b")]
@@ -263,24 +263,24 @@ MOVED_ONCE = [("gw-1", "gw-2"), ("", "gw-1")]
         ([RELEASE, CLAIM._replace(line="hall-2")], [("", "gw-2"), ("gw-1", "")]),
     ],
 )
-def test_reports_of_moves_are_shown_newest_first(moves: list[Move], shown: list[tuple[str, str]]) -> None:
-    """A release and the following claim of the same line are shown as one move."""
+def test_changes_of_masters_are_listed_newest_first(moves: list[Move], shown: list[tuple[str, str]]) -> None:
+    """A release and the following claim of the same line are listed as one change."""
     assert told(*moves) == shown
 
 
-def test_a_release_and_a_claim_by_two_gateways_are_one_move() -> None:
+def test_a_release_and_a_claim_of_a_line_form_one_change() -> None:
     """One gateway reports only the release, the other only the claim."""
     giver, taker = [FIRST, RELEASE], [move(2, None, ""), CLAIM]
     back = [move_of(one.as_json()) for one in (*giver, *taker, *giver)]
     assert told(*back) == MOVED_ONCE
 
 
-def test_a_move_is_read_back_unchanged_from_json() -> None:
+def test_a_change_of_masters_is_read_back_unchanged_from_json() -> None:
     one = move(7, None, "gw-1")
     assert move_of(one.as_json()) == one
 
 
-def test_only_the_newest_moves_are_kept() -> None:
+def test_only_the_newest_changes_of_masters_are_kept() -> None:
     moves = Moves(most=10)
     # in descending order: buckets are read independently, so older moves may be added later
     for turn in range(1000, 0, -1):

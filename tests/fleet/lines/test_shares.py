@@ -134,7 +134,7 @@ def test_a_starting_fleet_assigns_lines_when_no_more_gateways_join() -> None:
     assert trial.is_shared_with("b", "c")
 
 
-def test_a_gateway_older_than_3_s_assigns_lines_again_when_a_gateway_joins_or_ends() -> None:
+def test_lines_are_assigned_again_when_a_gateway_joins_or_leaves() -> None:
     trial = Trial()
     trial.clock.pass_s(SETTLE_S)
     assert trial.is_shared_with("b", "c")
@@ -222,12 +222,12 @@ def test_unopened_lines_are_tried_one_after_another_with_increasing_pauses() -> 
         wait_s = min(2 * wait_s, LAST_WAIT_NS / SECOND)
 
 
-def test_lines_that_no_gateway_can_open_are_tried_first_and_regularly() -> None:
+def test_a_line_that_no_gateway_can_open_is_retried_first() -> None:
     clock, unopened = reported(*"abc")
     unopened.hopeless = frozenset("b")
     for _ in range(5):
         clock.pass_s(FIRST_WAIT_NS / SECOND)
-        assert unopened.named() == {"a", "c"}
+        assert unopened.named() == {"a", "c"}  # b is tried, so it is not reported now
         failed(unopened, "b")
     unopened.hopeless = frozenset()
     clock.pass_s(FIRST_WAIT_NS / SECOND)
@@ -242,19 +242,20 @@ def test_the_other_unopened_lines_are_tried_immediately_after_one_was_opened() -
         unopened.opened(line)
 
 
-def test_a_gateway_first_tries_unopened_lines_of_its_own_share() -> None:
-    """If it tried a line that is assigned to another gateway, it would not get the line back."""
+def test_a_gateway_first_retries_the_lines_that_it_usually_polls() -> None:
+    """A line that another gateway usually polls would be assigned to that gateway, not to this one."""
     clock, unopened = reported(*"abcd")
     unopened.home = frozenset("bd")
     clock.pass_s(FIRST_WAIT_NS / SECOND)
     assert unopened.named() == {"a", "c", "d"}
     unopened.opened("b")
-    assert unopened.named() == frozenset()  # d is tried immediately, so it is not reported now
+    # After the success with b, none is reported: d is tried, and other gateways usually poll a and c.
+    assert unopened.named() == frozenset()
     unopened.opened("d")
     assert unopened.named() == frozenset()
 
 
-def test_the_trial_of_an_unopened_line_ends_if_the_line_is_not_assigned_again() -> None:
+def test_another_line_is_retried_if_the_first_one_is_not_assigned_in_time() -> None:
     clock, unopened = reported("a", "b")
     clock.pass_s(FIRST_WAIT_NS / SECOND)
     assert unopened.named() == {"b"}
@@ -272,7 +273,7 @@ SHARED = assign(SIXTY, ["a", "b", "c"])
 OF_A = {line for line, name in SHARED.items() if name == "a"}
 
 
-def test_only_unopened_lines_move_and_all_gateways_compute_the_same_moves() -> None:
+def test_all_gateways_reassign_exactly_the_lines_that_cannot_be_opened() -> None:
     found = hand_over(SHARED, {"a": OF_A, "b": [], "c": []})
     assert set(found.values()) == {"b", "c"}
     assert {line for line in SIXTY if found[line] != SHARED[line]} == OF_A

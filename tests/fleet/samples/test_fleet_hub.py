@@ -126,7 +126,7 @@ async def read_all(path: ServerPath, sink: SampleSink, place: int, every: float 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("is_behind_for", [3, 10_000], ids=["looks", "ever"])
-def test_the_hub_waits_for_a_server_without_the_streams_newest_messages(
+def test_the_hub_waits_if_a_server_lacks_the_newest_messages(
     running: Cluster, monkeypatch: pytest.MonkeyPatch, is_behind_for: int
 ) -> None:
     looks = itertools.count()
@@ -165,7 +165,9 @@ async def test_each_row_is_stored_once_although_the_sink_fails(running: Cluster,
 
 
 @pytest.mark.slow
-async def test_messages_in_parts_are_stored_once(running: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_messages_that_are_read_in_several_parts_are_stored_once(
+    running: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(hub_module, "MOST_READ", 3)
     async with empty_stream(running) as path:
         await say_all(path, 1, 12)
@@ -178,7 +180,7 @@ async def test_messages_in_parts_are_stored_once(running: Cluster, monkeypatch: 
 
 @pytest.mark.long
 @pytest.mark.parametrize("is_good", [True, False], ids=["rows", "garbage"])
-async def test_the_hub_limits_the_memory_of_a_commit(
+async def test_the_memory_for_one_transaction_of_the_hub_is_limited(
     running: Cluster, monkeypatch: pytest.MonkeyPatch, is_good: bool
 ) -> None:
     """Even few rows need much memory if their names are long. Ignored messages need memory too."""
@@ -195,7 +197,7 @@ async def test_the_hub_limits_the_memory_of_a_commit(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("fates", ["", "bab"], ids=["at once", "after failures"])
-async def test_the_hub_counts_lost_and_doubled_messages_once(
+async def test_the_hub_counts_each_missing_or_repeated_message_once(
     running: Cluster, caplog: pytest.LogCaptureFixture, fates: str
 ) -> None:
     async with empty_stream(running) as path:

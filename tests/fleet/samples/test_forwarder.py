@@ -355,7 +355,7 @@ def chaos(monkeypatch: pytest.MonkeyPatch) -> Any:
 def test_the_check_after_random_kills_finds_lost_and_duplicated_rows(chaos: Any) -> None:
     told = {"gateway-1": {0: 4, 1_000_000: 2}, "gateway-2": {0: 3}}
     whole = {
-        # the lost rows 4 and 5 were not reported as lost
+        # rows 4 and 5 were stored, although the gateway was killed before it had reported them
         "gateway-1": Counter([0, 1, 2, 3, 4, 5, 1_000_000, 1_000_001]),
         "gateway-2": Counter([0, 1, 2]),
     }

@@ -259,7 +259,7 @@ async def test_a_connection_that_is_no_longer_read_is_replaced(one: Cluster) -> 
 
 
 @pytest.mark.usefixtures("way")
-async def test_messages_that_answer_no_batch_are_delivered_as_usual(one: Cluster) -> None:
+async def test_a_single_request_after_a_batch_of_requests_is_answered(one: Cluster) -> None:
     client = await connect(one.urls[0], {})
     assert isinstance(client, BatchClient)
     await client.replies([Request("$JS.API.INFO", b"")], 5.0)

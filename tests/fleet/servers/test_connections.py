@@ -295,13 +295,15 @@ async def test_no_bucket_is_handed_over_without_a_silent_server(servers: Servers
 
 
 @pytest.mark.parametrize(("unheard_ns", "is_due"), [(1_900_000_000, False), (2_100_000_000, True), (0, True)])
-async def test_a_server_is_silent_after_two_seconds(servers: Servers, unheard_ns: int, is_due: bool) -> None:
+async def test_a_server_counts_as_silent_after_two_seconds(
+    servers: Servers, unheard_ns: int, is_due: bool
+) -> None:
     servers.silent, servers.unheard_ns = {"n3"}, unheard_ns
     await servers.pass_s(1)
     assert (servers.terms[names.LEASES[0]] > 1) is is_due
 
 
-async def test_leaders_change_more_often_than_a_silent_server_starts_elections(servers: Servers) -> None:
+async def test_buckets_change_their_leaders_before_a_silent_servers_next_election(servers: Servers) -> None:
     servers.silent = {"n3"}
     for second in range(60):
         await servers.pass_s(1)
@@ -312,7 +314,7 @@ async def test_leaders_change_more_often_than_a_silent_server_starts_elections(s
     assert HAND_OVER_S < ASKS_S
 
 
-async def test_leadership_moves_again_after_an_election_while_a_server_is_silent(servers: Servers) -> None:
+async def test_a_bucket_changes_its_newly_elected_leader_while_a_server_is_silent(servers: Servers) -> None:
     servers.silent = {"n3"}
     servers.leaders[names.LEASES[2]] = "n1"
     await servers.pass_s(1)

@@ -182,7 +182,7 @@ def test_servers_that_cannot_decide_have_no_quorum(nats: Cluster, monkeypatch: p
 
 @pytest.mark.slow
 def test_init_waits_until_a_new_plant_can_be_read(nats: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Right after a bucket was created, no server may answer reads from it."""
+    """Servers may refuse to read from a bucket that was created a moment ago."""
     collect, failures = ServerPath.collect, [OutcomeUnknown("it ended with 503")] * 2
 
     async def fail_at_first(self: ServerPath, subject: str, data: bytes) -> list[DirectMessage]:
@@ -432,7 +432,7 @@ def test_a_line_record_has_only_the_permissions_of_its_own_drives(tmp_path: Path
 CHANNEL = '[[line.drive.channel]]\nname = "half"\nvalue = "{} / 2"\nunit = "{}"\n'
 
 
-def test_computed_channels_of_a_line_are_in_its_record(tmp_path: Path) -> None:
+def test_computed_channels_of_a_line_are_stored_with_its_description(tmp_path: Path) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(PLANT + CHANNEL.format("output_frequency", "Hz"))
     *_, last = lines_again(path, tmp_path / "copy")

@@ -25,7 +25,9 @@ from multidrop import Poller
 WARM_UP_S = 1.0
 # Kernel threads that pass bytes from a port to a program: work items, softirqs and USB/IP.
 PASSING_ON = re.compile(r"kworker/|ksoftirqd/|vhci_[rt]x")
-PRIORITY = 2  # higher than that of the core's thread, as in kernels with threaded interrupts
+# Real-time priority of these kernel threads. It is higher than that of multidrop's thread, as in kernels with
+# threaded interrupts.
+PRIORITY = 2
 TRACING = Path("/sys/kernel/tracing")
 EVENTS = ("workqueue_queue_work", "workqueue_execute_start")
 QUEUED = re.compile(r" (\d+\.\d+): workqueue_queue_work: work struct=(\w+) function=flush_to_ldisc ")
