@@ -163,7 +163,7 @@ class NotMaster(BusError):
 
 
 class PollingFailed(BusError):
-    """The poller's own thread failed, on all lines; `__cause__` says why."""
+    """Polling has ended on all lines, because the poller's thread failed; `__cause__` says why."""
 
 
 class NotAttached(ValueError):
@@ -202,10 +202,10 @@ ANOTHER_FAMILY = "another family is at its address"
 
 
 class WriteForbidden(BusError, ValueError):
-    """The library did not send the write; its fields hold the register, the rule, and the manual's section.
+    """The library did not send a write, because a rule forbids it.
 
-    `is_budget` is True if the write was refused only to save the register's EEPROM, so that it may be sent
-    later.
+    The exception has the register, the rule, and the manual's section. `is_budget` is True if the write was
+    refused only to save the register's EEPROM, so that it may be sent later.
     """
 
     def __init__(
@@ -234,4 +234,4 @@ class WriteForbidden(BusError, ValueError):
 
 
 class CheckAgain(Exception):
-    """Raised if a drive answers as another family would: check it again after the other drives' stops."""
+    """A drive to stop answers as another family would: stop the others first, then check it again."""

@@ -39,7 +39,8 @@ from multidrop.toml_check import check_period
 from multidrop.transport import clock
 from multidrop.transport.statistics import LineStatistics
 
-LOOK_NS = 50_000_000  # interval between checks of the lines, if a line has a problem or `fileno` is in use
+# interval between checks of the lines, if a line has a problem, or if the program has called `fileno`
+LOOK_NS = 50_000_000
 # the same interval if realtime scheduling was granted, so that values reach the program earlier
 PROMPT_NS = 20_000_000
 # interval between checks of the lines, if lines only need new exchanges; shorter than AHEAD_NS, so that no
@@ -101,7 +102,7 @@ class Poller(RowSource):
         super().__init__(row_queue, self._lines.names, Realtime())
         self._path, self._totals = plant.path, plant.totals
         self._thread = threading.Thread(target=self._run, name="multidrop poller", daemon=True)
-        self._look_ns = 0  # time of the next check of the lines that the core has not reported
+        self._look_ns = 0  # time of the next check of all lines
         self._is_failure_raised = False
         self._ending = threading.Lock()
         register_at_fork(self)
@@ -242,7 +243,7 @@ class Poller(RowSource):
                 clock.sleep(FAILED_NS / 1e9)
 
     def _tend_lines(self) -> None:
-        """Wait for the core's reports or the next check; then call `tend` of the lines that need it."""
+        """Wait until the C core reports a line or the next check is due; then tend the lines that need it."""
         try:
             self._realtime.lower_nice()
         except OSError:
@@ -273,7 +274,10 @@ class Poller(RowSource):
 
     @property
     def polled_since(self) -> dict[str, int]:
-        """By drive name: the `monotonic_ns` from which on rows come from the present drive of that name."""
+        """The `monotonic_ns` since which each drive is polled, by drive name.
+
+        Older rows may be from an earlier drive of the same name.
+        """
         return {name: since_ns for line in self._lines for name, since_ns in line.since_ns.items()}
 
     def _adopt_channels(self) -> None:
@@ -474,7 +478,8 @@ class Poller(RowSource):
     def line_failures(self) -> dict[str, str]:
         """The exceptions of lines on which polling failed recently, by the line's name.
 
-        Such a line is tried again within 30 s, and is no longer listed after 10 s without another exception.
+        Polling of such a line is retried within 30 s. If there is no other exception for 10 s after the
+        retry, the line is no longer listed.
         """
         return {line.name: line.failure for line in self._lines if line.failure}
 

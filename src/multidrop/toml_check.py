@@ -121,12 +121,12 @@ class TomlPlace:
             yield table, replace(self, labels=(*self.labels, label), steps=steps)
 
     def within(self, label: str, *tables: str) -> TomlPlace:
-        """Return the place, labelled `label`, of the subtable under the keys `tables`."""
+        """Return the place of a subtable at this path of keys. Error sentences call it `label`."""
         steps = (*self.steps, *((table, 1) for table in tables))
         return replace(self, labels=(*self.labels, label), steps=steps)
 
     def of_file(self, path: Path) -> TomlPlace:
-        """Return the place of another file that this file names; its errors are added to the same list."""
+        """Return the place of a whole other file, whose errors are added to the same list."""
         return TomlPlace(path, (), self.config_errors, self.seen)
 
     def wrong(self, sentence: object, key: str = "") -> None:
@@ -266,8 +266,8 @@ ADDRESS: Mapping[str, Any] = {"pattern": f"^({_IPV6}|{_HOST_NAME}|{_IPV4}):{PORT
 def ascending() -> dict[str, Any]:
     """Return the JSON Schema of two numbers in ascending order.
 
-    A JSON Schema cannot compare two numbers. So this one compares both with a list of limits: if the first
-    number is at least a limit, the second must be too.
+    A JSON Schema can compare a number only with a constant. This schema has a list of constants: if the first
+    number reaches a constant, the second number must reach it too.
     """
     powers = [sign * digit * 10**power for power in range(7) for digit in (1, 2, 5) for sign in (-1, 1)]
     limits = sorted({0, *powers, *(power / 1000 for power in powers)})
@@ -286,9 +286,9 @@ def distinct() -> dict[str, Any]:
     """Return the JSON Schema "distinct", and the schemas to which it refers.
 
     It accepts tables such as { stopped = 0, running = 1 } if no two names have the same whole number. A JSON
-    Schema cannot compare the values of names that it does not know. But it can divide the names into two
-    groups by their first or last character, and reject a number that both groups have. It does so for several
-    pairs of groups, so that most pairs of names are in different groups at least once.
+    Schema cannot compare two values with each other. But it can divide the names into two groups by their
+    first or last character: if a number occurs in one group, it must not occur in the other group. The schema
+    does so with several divisions, so that most pairs of names are in different groups at least once.
     """
     letters = [f"{small}{small.upper()}" for small in ascii_lowercase]
     characters = [*letters, "_", *digits]
@@ -297,7 +297,7 @@ def distinct() -> dict[str, Any]:
         for bit in range(len(characters).bit_length())
     ]
     groups = [[form.format(half) for half in each] for form in ("^[{}]", "[{}]$") for each in halves]
-    # the schema detects duplicates of these numbers: all bit numbers, and most raw counts that have a name
+    # Duplicates of other numbers are not found. Bits have no others, and named raw counts seldom have.
     numbers = range(16)
     parts: dict[str, Any] = {
         f"not-{number}": {"not": {"const": number, "description": f"another name has the number {number}"}}

@@ -113,8 +113,8 @@ class _Cause(NamedTuple):
 
     message: str  # regular expression for tomllib's message
     line: str  # regular expression for the whole wrong line
-    # The explanation. It may contain groups of `line`, {rest} (the line from the wrong column on) and {first}
-    # (", first in line 5", if line 5 has the same key or header).
+    # The explanation. It may contain {first} (", first in line 5", if line 5 has the same key or header), and
+    # {rest} (the part of the line from the wrong column on), and the names of groups in the pattern `line`.
     sentence: str
 
 
@@ -361,7 +361,7 @@ class _LineScan:
         self._is_value, self._parts = True, []
 
     def _place(self) -> Steps:
-        """Record the line of a list's element; return the path of a table that starts at this place."""
+        """Return the path that a table has if it starts here. In a list, record the element's line number."""
         if not (self._open and self._open[-1].is_list):
             steps, name = self._key
             return (*steps, (name, 1))

@@ -144,7 +144,7 @@ def test_the_commands_convert_and_report_ask_for_one_segment_file(run: Run, tmp_
         (["--trigger", "key"], "--trigger needs --out"),
         (["--trigger", "key", *OUT, "--rotate", "1 h"], "--trigger and --rotate exclude each other"),
         (["--trigger", "key", "--out", "a.txt"], "a.txt: a recording's name must end in .arrows"),
-        (["--trigger", "key", *OUT], "--trigger key needs a terminal and excludes --json"),
+        (["--trigger", "key", *OUT], "the trigger 'key' needs a terminal without --json"),
         (["--pre", "1 s"], "--pre and --post belong to a trigger"),
     ],
 )

@@ -104,7 +104,7 @@ verbs = ["pump-1.fly"]
         "[serve.may]: write: 'setpoint' is not right; write write = [\"pump-1.frequency_setpoint\"]",
         "[serve.may]: write: pump-1.setpint: INVT CHE has no register 'setpint'; did you mean setpoint or "
         "pid_setpoint?",
-        "[serve.may]: verbs: 'fly' of pump-1 is not a verb that can be listed here; choose from start, jog, "
+        "[serve.may]: verbs: 'fly' of pump-1 cannot be allowed; choose from start, jog, "
         "reset_fault, set_frequency, coast",
         f"[serve]: audit {tmp_path}/no/such/folder/audit.jsonl cannot be written: No such file or directory",
     ]
@@ -189,10 +189,10 @@ def test_a_drive_name_with_a_star_is_not_read_as_a_pattern(tmp_path: Path) -> No
     ("may", "sentence"),
     [
         ('verbs = ["fan-?.start"]', "there is no drive 'fan-?'; did you mean fan-1"),
-        ('verbs = ["pump-1.*"]', "'*' of pump-1 is not a verb that can be listed here; choose from start, "),
+        ('verbs = ["pump-1.*"]', "'*' of pump-1 cannot be allowed; choose from start, "),
         (
             'verbs = ["*.stop"]',
-            "*.stop matches no register or verb: 'stop' of fan-1 is not a verb that can be listed here",
+            "*.stop matches no register or verb: 'stop' of fan-1 cannot be allowed",
         ),
         ('verbs = ["Pump-*.start"]', "Pump-*.start matches no register or verb: there is no drive 'Pump-*'"),
         ('write = ["*.output_current"]', "fan-1.output_current is never written: it can only be read"),
@@ -203,7 +203,7 @@ def test_a_drive_name_with_a_star_is_not_read_as_a_pattern(tmp_path: Path) -> No
         ),
         (
             'family.invt-che = { verbs = ["pump-1.start"] }',
-            "'pump-1.start' of pump-1 is not a verb that can be listed here",
+            "'pump-1.start' of pump-1 cannot be allowed",
         ),
         ('family.invt-che = { look = ["token"] }', "family invt-che: unknown key 'look'"),
         ('family.invt-che = ["start"]', "family invt-che: ['start'] is not a table with write, verbs"),

@@ -436,7 +436,7 @@ def test_adopt_refuses_more_drive_names_than_a_batch_can_number() -> None:
         for number in range(65534):
             made.poller._lines.names.drives.number(f"gone-{number}")
         assert made.poller.adopt(plant(hall(*pumps()))) == {}
-        with pytest.raises(ValueError, match="at most 65536 names of drives while it runs"):
+        with pytest.raises(ValueError, match="at most 65536 different names of drives during its life"):
             made.poller.adopt(plant(hall(toy("pump-1", 1), toy("one-more", 3))))
         check_rates(made, pump_2=0.1)
 

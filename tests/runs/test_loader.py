@@ -221,7 +221,7 @@ def test_a_step_must_be_long_enough_for_all_its_writes(tmp_path: Path) -> None:
 
 @table("dwell, within", [(float("nan"), 0.0), (float("inf"), 0.0), (-1.0, 0.0), (0.0, float("nan"))])
 def test_a_step_that_would_never_end_is_refused(dwell: float, within: float) -> None:
-    with pytest.raises(ValueError, match="dwell and within must be 0 s or more, and finite"):
+    with pytest.raises(ValueError, match="`dwell` and `within` must be finite times of 0 s or more"):
         RunStep("a", dwell=dwell, within=within)
 
 

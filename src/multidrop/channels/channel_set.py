@@ -15,7 +15,7 @@ MOST_CHANNELS = 1000  # limit of channels in a plant
 MOST_NAME = 100  # limit of characters in a channel's name, and in its unit
 UNSEEN = -1  # status of a register or channel that has had no row yet
 OLD = -2  # status of a register or channel whose newest value is too old
-# in ns: a smaller increase of the computer's time asleep is ignored, because it is inexact
+# in ns: the operating system reports the time asleep inexactly, so shorter sleeps are ignored
 LEAST_SLEEP_NS = 100_000_000
 
 
@@ -31,13 +31,13 @@ class Mistake(NamedTuple):
 
 
 class SlotRow(NamedTuple):
-    """A row of a register or channel; `slot` is its index.
+    """A row of a register or channel.
 
     Only a row with the status 0 has a value. A channel's row has the status OLD if one of its registers has
     had no row for too long.
     """
 
-    slot: int
+    slot: int  # index of the register or channel
     time_ns: int
     monotonic_ns: int
     uncertainty_ns: int
@@ -276,7 +276,8 @@ class ChannelSet:
         changed = {slot for (drive, _), slot in self.inputs.items() if drive in replaced}
         for one in self._computed:
             if not one.program.slots.isdisjoint(changed):
-                changed.add(one.slot)  # a channel that was declared later may use this one
+                # so that the channels that use this channel are interrupted too
+                changed.add(one.slot)
                 one.program.interrupt(changed)
 
     def totals(self) -> dict[str, Any]:
@@ -316,7 +317,10 @@ class ChannelSet:
 
 
 def _numbers(about: Any, computed: _Computed) -> list[list[float]] | None:
-    """Return a channel's stored totals as numbers; None if damaged, or of another expression."""
+    """Return a channel's stored totals as numbers.
+
+    Return None if they are damaged, or if the channel's expression has changed.
+    """
     program = computed.program
     if not isinstance(about, dict) or about.get("value") != computed.channel.value:
         return None

@@ -252,7 +252,7 @@ def _root_of(value: float) -> Value:
 
 
 def _chosen(condition: Value, then: Value, otherwise: Value) -> Value:
-    """Return the chosen value. The other one may be unknown, as after a division by zero."""
+    """Return `then` or `otherwise`; None if the condition is unknown. The unused value may be unknown."""
     return None if condition is None else then if condition else otherwise
 
 

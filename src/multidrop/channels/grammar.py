@@ -50,9 +50,9 @@ class ReferenceStep(NamedTuple):
 
 
 class CallStep(NamedTuple):
-    """A step of a parsed expression: a call of a function or operator with the last `arity` operands.
+    """A step of a parsed expression: a function or operator that is applied to the last `arity` operands.
 
-    A minus sign is the operator "-1".
+    The negation -x has the name "-1", because "-" is the subtraction.
     """
 
     column: int

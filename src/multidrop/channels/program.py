@@ -284,8 +284,8 @@ class Program:
     def run(self, values: Sequence[Value], fresh: Collection[int], now_ns: int) -> Value:
         """Return the value in the declared unit, computed from the newest values of registers and channels.
 
-        Return None if the value is unknown. `fresh` are the indexes of the registers and channels with a row
-        from the request that was sent at `now_ns` (monotonic).
+        Return None if the value is unknown. `now_ns` is the monotonic time of a request. `fresh` has the
+        indexes of the registers and channels with a row from that request.
         """
         stack: list[Value] = []
         for step in self._instructions:

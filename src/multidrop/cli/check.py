@@ -113,7 +113,10 @@ def _check_plant(arguments: argparse.Namespace) -> int:
 
 
 def _family(file: Path) -> type[Drive]:
-    """Return the family in a file, or the built-in family of this name. Raises ValueError for other names."""
+    """Return the family in a file, or the installed family of this name.
+
+    Raises ValueError for an unknown name, and for a built-in family: it has no file to check.
+    """
     name = str(file)
     if name in MODELS:
         raise ValueError(f"{name} is built in and has no file; see `multidrop models {name}`")

@@ -20,7 +20,8 @@ from multidrop.transport.port_identity import of_name
 
 LATENCY_MS = 1  # in ms: advise the user to lower the adapter's latency timer if it is longer
 ROUNDS = 20
-SLOW_S = 0.005  # s; advise the user if replies are later than usual for the family by more than this
+# in s: advise the user if the response delay exceeds the delay that is usual for the family by more than this
+SLOW_S = 0.005
 
 
 _LEVELS = {RS485.RTS_UP: "on", RS485.RTS_DOWN: "off"}
@@ -221,12 +222,12 @@ def wake_finding(
     *,
     is_realtime: bool = False,
 ) -> Finding:
-    """Return a finding: whether this computer wakes a thread in time for a line with these settings.
+    """Return a finding: does this computer wake threads early enough for a line with these settings?
 
     `realtime` is the lateness under realtime scheduling, or the reason why the system refuses it.
-    `is_realtime` is the plant file's key `realtime`. The 99th percentile must be below t3.5, the silence that
-    precedes each request anyway. If multidrop switches RTS, even the greatest lateness must be below t3.5: a
-    drive may answer after t3.5, and a later switch would cut off the first bytes of its reply.
+    `is_realtime` is the plant file's key `realtime`. The 99th percentile of the lateness must be below t3.5,
+    the silence before each request. If multidrop switches the RTS signal, even the greatest lateness must be
+    below t3.5, because a drive may answer after t3.5. Until RTS is switched, the reply is cut off.
     """
     limit, kind = settings.t3_5, "max" if switch in _LEVELS else "p99"
 

@@ -87,9 +87,9 @@ def watch(
 ) -> dict[str, Any]:
     """Poll the plant and show it until the user quits or `seconds` have passed; return the poller's summary.
 
-    `how` says which triggers are recorded and shown; None: all rows are recorded. `beside` returns a context
-    that lasts while the plant is polled. The monitor also ends when the terminal is closed. Stops in progress
-    are always finished before it ends.
+    If `how` is given, only the rows around triggers are recorded, and they are shown as curves. Otherwise all
+    rows are recorded. `beside` makes a context for the time of polling, such as the demo's operator. The
+    monitor also ends when the terminal is closed. It always waits for stops in progress.
     """
     screen = Screen()
     _check_size(screen)
@@ -179,7 +179,10 @@ class Monitor:
         self._at.message = text
 
     def await_stops(self) -> list[str]:
-        """Wait for the stops in progress, and record rows meanwhile; return the unacknowledged failures."""
+        """Wait for the stops in progress, and record rows meanwhile.
+
+        Return the failures of stops that the user has not acknowledged.
+        """
         if self._is_stopping:
             warn(STILL_STOPPING)
         while self._is_stopping:

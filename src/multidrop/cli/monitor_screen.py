@@ -42,7 +42,7 @@ class Position:
     question: str = ""
     message: str = ""
     failures: list[str] = field(default_factory=list)  # unacknowledged failures of stops
-    failures_shown: int = 0  # number of failures that the last picture showed
+    failures_shown: int = 0  # number of failures that are on the screen now
     # lines of text that draw the curves around the last trigger
     trigger: list[str] = field(default_factory=list)
 

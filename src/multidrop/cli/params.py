@@ -153,7 +153,10 @@ def _is_file(words: list[str]) -> bool:
 
 
 def _both(one: Target | ParameterSet, other: Target | ParameterSet) -> tuple[ParameterSet, ParameterSet]:
-    """Return the two parameter sets to compare. If one is a file, read only its parameters from the drive."""
+    """Return the two parameter sets to compare.
+
+    If one of them is a file, only the parameters in the file are read from the drive.
+    """
     sides = [
         ParameterSet(each.drive.model, {}, source=each.drive.name) if isinstance(each, Target) else each
         for each in (one, other)

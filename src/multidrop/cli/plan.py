@@ -59,7 +59,7 @@ def _plan(line: PlantLine) -> _PredictedLine:
     suggestions = None if prediction.fits else suggest(wanted, prediction, line.switching)
     misfits = [_misfit(rate, rate.every) for rate in prediction.rates if rate.every and not rate.fits]
     warnings = [*_long_cycle(line, prediction)]
-    for polled in line.drives:  # warn if `readable_gaps` would save bus time for a user's own class
+    for polled in line.drives:
         gain = reading_gain(polled.drive, polled.wanted) if is_users_own(type(polled.drive)) else None
         if gain:
             warnings.append(f"{polled.drive.name}: {gain}")

@@ -103,7 +103,9 @@ def run(arguments: argparse.Namespace) -> int:
     plant = replace(plant, realtime=arguments.realtime or plant.realtime)
     plant, triggering = triggering_of(plant, arguments)
     if "key" in arguments.trigger and (arguments.json or not keys_are_readable()):
-        raise ValueError("--trigger key needs a terminal and excludes --json; give a condition instead")
+        raise ValueError(
+            "the trigger 'key' needs a terminal without --json; give a condition instead, such as fault"
+        )
     return conclude(plant, follow(plant, arguments, triggering or rotation), arguments)
 
 
@@ -262,7 +264,7 @@ class LiveTable:
         self._samples: Counter[str] = Counter()
         self._misses: Counter[str] = Counter()
         self.note = ""  # a sentence that is shown below the table
-        self._trigger: Path | None = None  # the recording of the trigger whose picture is shown
+        self._trigger: Path | None = None  # recorded file that is shown in `_picture`
         self._picture: list[str] = []
         self._drawn: list[str] = []  # lines of text that are on the terminal now
         self._next_draw = 0.0
@@ -349,9 +351,11 @@ class LiveTable:
 
 
 class Keys:
-    """The keys of `poll`: `m` starts a comment, which gets the time of this key press; `t` is a trigger.
+    """Handles the keys of `multidrop poll`.
 
-    A comment is a row of the recording, so without a recording the key `m` only shows NO_RECORDING.
+    The key `m` starts a comment, which gets the time of the key press. A comment is a row of the recording.
+    Without a recording, the key only shows NO_RECORDING. If rows around triggers are recorded, the key `t` is
+    a trigger.
     """
 
     def __init__(

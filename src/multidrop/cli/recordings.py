@@ -85,8 +85,8 @@ def _convert(arguments: argparse.Namespace) -> None:
 def _import_library(out: Path) -> None:
     """Import the library that an export to this file needs, if it is installed.
 
-    A signal during the import ends the command only after it. Raised earlier, the KeyboardInterrupt could be
-    caught by asammdf's own `except:`.
+    Ctrl-C during the import takes effect after the import. An earlier KeyboardInterrupt could be caught by
+    an `except:` of asammdf.
     """
     if out.suffix.lower() not in EXPORTS:
         return

@@ -215,7 +215,7 @@ def _scan(
 
 
 def _families(models: Sequence[str]) -> dict[str, type[Drive]]:
-    """Return the families by their names in a plant file. The name of a model file is its absolute path."""
+    """Return the families by their names in a plant file. Names of model files contain an absolute path."""
     named = {}
     for text in models or (*MODELS, *RECOGNISABLE):
         path, colon, name = text.rpartition(":")

@@ -167,7 +167,10 @@ def _target(arguments: argparse.Namespace) -> tuple[Target, list[str]]:
 
 
 def _opened(target: Target, arguments: argparse.Namespace) -> Bus:
-    """Open the drive's port and return the bus. If opening fails, raises LineError, or for a stop OSError."""
+    """Open the drive's port and return the bus.
+
+    If the port cannot be opened, raises OSError for a stop command, and LineError for others.
+    """
     audit = _audit_file(arguments)
     try:
         return target.open_bus(audit)

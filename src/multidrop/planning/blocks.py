@@ -235,7 +235,7 @@ def _side_by_side(drive: Drive, wanted: list[tuple[range, Register[Any]]]) -> _N
 
 @dataclass(frozen=True)
 class _Division:
-    """A division of registers into requests. No other one with as many requests has fewer characters."""
+    """One way to read registers: with as many requests, no other way transfers fewer characters."""
 
     characters: int  # characters of all requests and their replies
     spans: tuple[tuple[int, int], ...]  # begin and end of each request, which reads registers[begin:end]
@@ -247,15 +247,16 @@ class _Division:
 
 @lru_cache(maxsize=256)
 def _divisions(framing: Framing, neighbours: _Neighbours) -> tuple[_Division, ...]:
-    """Return the divisions of these registers that may be the quickest, sorted by number of requests.
+    """Return the ways to divide these registers into requests that may be the quickest.
 
-    It depends on the drive's response delay which one is the quickest: if the delay is long, one with few
-    requests; if it is short, one with few characters. The algorithm is dynamic programming over the first
-    register of the last request.
+    They are sorted by number of requests. Few requests are quickest if the drive's response delay is long;
+    few characters, if it is short. The algorithm is dynamic programming over the first register of the last
+    request.
     """
-    fronts: list[list[_Division]] = [[_Division(0, ())]]  # item n: the divisions of the first n registers
+    # item n: ways to divide the first n registers into requests
+    fronts: list[list[_Division]] = [[_Division(0, ())]]
     for end in range(1, len(neighbours.registers) + 1):
-        fewest: dict[int, _Division] = {}  # divisions with the fewest characters, by number of requests
+        fewest: dict[int, _Division] = {}  # ways with the fewest characters, by number of requests
         for begin, count in neighbours.ending_at(end):
             own = characters(framing, neighbours.carrier, count)
             for before in fronts[begin]:
@@ -268,7 +269,7 @@ def _divisions(framing: Framing, neighbours: _Neighbours) -> tuple[_Division, ..
 
 
 def _worthwhile(divisions: dict[int, _Division]) -> list[_Division]:
-    """Drop each division that has more requests than another one, but not fewer characters."""
+    """Drop the ways that need more requests than another way, and at least as many characters."""
     kept: list[_Division] = []
     for requests in sorted(divisions):
         if not kept or divisions[requests].characters < kept[-1].characters:
@@ -277,7 +278,7 @@ def _worthwhile(divisions: dict[int, _Division]) -> list[_Division]:
 
 
 def _equal_delay(drive: Drive, few: _Division, many: _Division) -> float:
-    """Return the response delay in s at which both divisions take equally long."""
+    """Return the response delay in s at which few and many requests take equally long."""
     saved = (few.characters - many.characters) * drive.settings.character
     return saved / (many.requests - few.requests) - silence(drive)
 
@@ -312,23 +313,23 @@ def may_be_too_long(drive: Drive, block: Block) -> bool:
 
 
 def least(drive: Drive, block: Block) -> Block:
-    """Return the smallest part of a request: the first registers that one request must read together."""
+    """Return a short request: for the block's first register, and for those that must be read with it."""
     return Block.of(drive, _units(drive, block)[0])
 
 
-# ---- proofs ----
+# ---- proofs: read requests whose replies show that no late reply to an earlier request can still come ----
 
 
-MOST_PROOFS = 4  # limit of a drive's requests that serve as proofs, because each one uses memory
+MOST_PROOFS = 4  # limit of a drive's proofs, because each one uses memory
 
 # If a device's own registers allow too few different replies, its proofs also read these tables. Even an
 # exception reply has the function code of its table.
 OTHER_TABLES = (INPUT, COIL, HOLDING, DISCRETE)
-# Number of different proofs that a drive needs. The second one is needed while a late reply to the first one
-# may still come. The third one is only sent when a silent drive answers again.
+# Number of different proofs that a drive needs. While a late reply to the first proof may still come, the
+# second one is sent. The third one is only sent when a silent drive answers again.
 ENOUGH = 3
 
-RawRange = tuple[int, int]  # lowest and highest raw count that the only register of a reply can have
+RawRange = tuple[int, int]  # lowest and highest raw count that a register can have
 
 
 def proofs(drive: Drive) -> list[tuple[Block, RawRange | None]]:
@@ -356,7 +357,7 @@ def proofs(drive: Drive) -> list[tuple[Block, RawRange | None]]:
 
 @lru_cache(maxsize=256)
 def _with_distinct_replies(family: Any) -> tuple[tuple[Register[Any], ...], ...]:
-    """Return the registers of requests whose replies all differ, one tuple of registers for each request.
+    """Return requests with different forms of replies, each as the tuple of registers that it reads.
 
     Requests for readings come first, because readings are polled anyway. Shorter requests come before longer
     ones. If there are many requests, only the first MOST_PROOFS and the last one are returned.
@@ -374,7 +375,7 @@ def _with_distinct_replies(family: Any) -> tuple[tuple[Register[Any], ...], ...]
 
 
 def _of_other_tables(drive: Drive, found: Sequence[Block]) -> list[Block]:
-    """Return a read of each table in OTHER_TABLES whose function code no request in `found` has."""
+    """Return a read request for each table in OTHER_TABLES with a function code that `found` lacks."""
     start = found[0].start if found else 0
     functions = {block.table.read for block in found}
     return [
@@ -385,7 +386,7 @@ def _of_other_tables(drive: Drive, found: Sequence[Block]) -> list[Block]:
 
 
 def _shape(first: Register[Any], count: int) -> Hashable:
-    """Return the properties of a read request that its reply shows, such as its function code."""
+    """Return what a reply reveals about its request, such as the function code and number of registers."""
     if first.table.carrier is Carrier.LONG:
         return first.table.read, first.address
     if first.table.carrier is Carrier.BIT:

@@ -57,7 +57,7 @@ def switches(before: Drive, after: Drive) -> bool:
 def kind(drive: Drive) -> tuple[float, str]:
     """Return the drive's silence and line settings.
 
-    Drives with the same kind are polled one after another.
+    Drives that have both in common are polled one after another.
     """
     return silence(drive), str(drive.settings)
 
@@ -66,9 +66,9 @@ def in_order(drives: Iterable[Drive], switching: float = 0.0) -> list[Drive]:
     """Sort the drives so that a bus cycle has the least silence, and then the fewest switches.
 
     A switch is a change of the line's settings. Between two drives the line keeps the longer of their
-    silences. Therefore drives of the same kind (silence and settings) are polled one after another. Kinds are
-    inserted in order of their silence, each at its cheapest place. If switching takes no time, no other order
-    has a shorter bus cycle.
+    silences. Therefore drives of the same kind (silence and settings) are polled one after another. The kinds
+    are inserted in order of their silence, each at the place where it adds the least time. If switching takes
+    no time, no other order has a shorter bus cycle.
     """
     kinds: dict[tuple[float, str], list[Drive]] = {}
     for drive in drives:

@@ -24,7 +24,7 @@ from multidrop.planning.bus_time import gap, in_order, kind, silence, switches
 from multidrop.planning.schedule import TURN_SHARE, Job, Schedule
 
 LATENESS = 100e-6  # seconds that a typical computer adds to each exchange, to wake up and to write
-ENOUGH = 0.97  # a rate counts as reached from this fraction of the wanted rate on
+ENOUGH = 0.97  # fraction of the wanted rate that a reached rate must have
 LEAST_EXCHANGES = 1000  # least number of simulated exchanges
 LEAST_ROUNDS = 3  # least number of simulated exchanges per job
 FAR_NS = 1 << 62
@@ -207,12 +207,12 @@ def _run(jobs: Sequence[_PredictedJob], switching: float) -> None:
 
 @lru_cache(64)  # a plant often has several equal lines, and is often predicted more than once
 def _carried_out(
-    slots: tuple[_Slots, ...], owns: tuple[float, ...], gaps: tuple[tuple[float, ...], ...]
+    slots: tuple[_Slots, ...], durations: tuple[float, ...], gaps: tuple[tuple[float, ...], ...]
 ) -> tuple[_Done, ...]:
     """Simulate the exchanges of jobs in the schedule's order; return the results of each job.
 
-    `owns` are the jobs' times in s, without silence. `gaps[a][b]` is the pause in s from a drive of kind a to
-    a following drive of kind b.
+    `durations` are the times in s of the jobs, without silence. `gaps[a][b]` is the pause in s from a drive
+    of kind a to a following drive of kind b.
     """
     schedule: Schedule[Job] = Schedule()
     jobs = [Job(**one._asdict()) for one in slots]
@@ -226,7 +226,7 @@ def _carried_out(
     for _ in range(max(LEAST_EXCHANGES, LEAST_ROUNDS * len(jobs)) if timed else len(jobs)):
         ((job, not_before_ns, _),) = schedule.take(at, at, FAR_NS, 1)
         number = of_job[job]
-        own, known = owns[number], done[number]
+        own, known = durations[number], done[number]
         silent = gaps[before][slots[number].kind]
         begin_ns = max(at + round(silent * 1e9), not_before_ns, ready_ns.get(job.drive, 0))
         first_ns = known.first_ns if known.exchanges else begin_ns
@@ -292,7 +292,8 @@ class Suggestions:
     every: tuple[tuple[float, float], ...]  # pairs of a wanted period and a period that can be reached, in s
     # lowest baud rate that is enough, and the drives that now have a lower one
     baudrate: tuple[int, tuple[Drive, ...]] | None
-    registers: int | None  # largest number of registers per drive, for drives whose rates do not fit
+    # number of registers that the line can read per drive, for drives whose rates it does not reach now
+    registers: int | None
 
     def __str__(self) -> str:
         pairs = (f'every = "{duration_text(new)}" instead of {duration_text(old)}' for old, new in self.every)
@@ -328,11 +329,11 @@ def suggest(exchanges: Sequence[Planned], prediction: Prediction, switching: flo
 def _every(
     exchanges: Sequence[Planned], tight: Sequence[Rate], least: float, switching: float
 ) -> tuple[tuple[float, float], ...]:
-    """Lengthen the periods of the rates `tight`, which the line does not reach, until all rates are reached.
+    """Return longer periods for the rates `tight`, with which the line reaches all rates.
 
-    Return pairs in s: the wanted period, and the longer period. All wanted periods are multiplied by the
-    same factor, at least `least`. The search always ends: the other exchanges reach their rates already, and
-    longer periods leave them more time.
+    Each pair is a wanted period and its longer period, in s. All wanted periods are multiplied by the same
+    factor, which is `least` or greater. The search always ends: the other exchanges reach their rates
+    already, and longer periods leave them more time.
     """
     hasty = {(rate.drive, rate.every) for rate in tight}
     wanted = sorted({rate.every for rate in tight if rate.every})
@@ -356,7 +357,7 @@ def _rounded_up(seconds: float) -> float:
 
 
 def _baudrate(exchanges: Sequence[Planned], switching: float) -> tuple[int, tuple[Drive, ...]] | None:
-    """Return the lowest baud rate that reaches all rates, and the drives that now have a lower one."""
+    """Return the lowest baud rate with which the line can poll at all rates, and the drives to change."""
     wanted: dict[Drive, list[tuple[Register[Any], float | None]]] = {}
     for each in exchanges:
         wanted.setdefault(each.drive, []).extend((register, each.every) for register in each.block.registers)
@@ -422,7 +423,7 @@ class ReadingGain:
         )
 
     def _declaration(self) -> str:
-        """Return the text that declares the gaps in a family file or a class."""
+        """Return the text that declares these readable gaps in a family file or a class."""
         named = [(_NAMES.get(table, table.name), gap) for table, gap in self.gaps]
         if self.drive.declared_in:
             in_file = (f"{name.lower()} = [0x{gap[0]:X}, 0x{gap[-1]:X}]" for name, gap in named)
@@ -432,9 +433,9 @@ class ReadingGain:
 
 
 def reading_gain(drive: Drive, wanted: Iterable[tuple[Register[Any], float | None]]) -> ReadingGain | None:
-    """Return the bus time that these reads would save if the class declared readable gaps.
+    """Return the gain if requests could also read the undeclared addresses between registers.
 
-    Return None if the class already declares some, or if the gain is too small.
+    Return None if the class already allows this (`readable_gaps`), or if the gain is too small.
     """
     wanted = list(wanted)
     before = planned(drive, wanted)

@@ -17,26 +17,26 @@ from dataclasses import dataclass, field
 from typing import Generic, NamedTuple, TypeVar
 
 TURN_SHARE = 0.05  # least fraction of the line's time for jobs without a period
-# limit of the bus time that jobs without a period may use in advance
+# limit of the bus time that jobs without a period may use before they are entitled to it
 CREDIT_NS = 50_000_000
 NEVER_NS = 1 << 63
 SILENT_AFTER = 2  # number of successive failures after which a drive gets no requests for a while
 FIRST_PAUSE_NS = 500_000_000
 LONGEST_PAUSE_NS = 2_000_000_000
 SILENT_SHARE = 0.015  # fraction of the line's time for requests to silent drives
-# bus time that the second requests to all silent new drives may take together
+# limit of the bus time for retries of all new drives that left their first request unanswered
 SECOND_COST_NS = 400_000_000
 
 
 @dataclass(eq=False, kw_only=True)
 class Job:
-    """An exchange that is repeated with the drive at this address.
+    """An exchange with a drive that the schedule repeats.
 
     Jobs of one `kind` have the same line settings and silence. They take the least time if they follow each
     other.
     """
 
-    drive: int
+    drive: int  # the drive's address
     period_ns: int | None
     duration_ns: int
     # silence before the request; part of `duration_ns`, but may pass while the line is idle
@@ -113,7 +113,7 @@ class BackOff:
             self.health[drive].is_pending = False
 
     def has_pauses(self, at_ns: int) -> bool:
-        """Return False if no drive pauses now; True if one may pause, see `is_paused`."""
+        """Return False if no drive is paused now. If True, call `is_paused` for each drive."""
         return self.has_silent or at_ns < self._late_until_ns
 
     def is_paused(self, drive: int, at_ns: int) -> bool:
@@ -173,18 +173,18 @@ class BackOff:
         health.paused_until_ns = max(health.late_until_ns, now_ns + pause_ns)
 
     def _fair_pause_ns(self) -> int:
-        """Return a pause in ns after which requests to silent drives take only SILENT_SHARE of the time."""
+        """Return the pause in ns that limits requests to silent drives to SILENT_SHARE of the time."""
         return round(sum(health.cost_ns for health in self.health.values() if health.pause_ns) / SILENT_SHARE)
 
     def _end_next_pause(self, drive: int, now_ns: int) -> None:
-        """End the pause of the silent drive, other than `drive`, whose pause would end next."""
+        """Of the silent drives except `drive`, retry now the one with the shortest remaining pause."""
         paused = [health for number, health in self.health.items() if health.pause_ns and number != drive]
         if paused:
             first = min(paused, key=lambda health: health.paused_until_ns)
             first.paused_until_ns = min(first.paused_until_ns, max(now_ns, first.late_until_ns))
 
     def _try_new_again(self, now_ns: int) -> None:
-        """Let silent new drives be tried again now, if all new drives had a request and few were silent."""
+        """Retry silent new drives now, if all new drives were asked and the retries take little time."""
         new = [health for health in self.health.values() if health.is_new]
         silent = [health for health in new if health.failures == 1]
         if all(health.failures for health in new) and sum(each.cost_ns for each in silent) <= SECOND_COST_NS:
@@ -213,9 +213,9 @@ class Schedule(Generic[J]):
         # earliest time of the next request, by drive; only for drives with a least interval
         self._ready: dict[int, int] = {}
         self._held: list[J] = []  # jobs without a period that wait for the end of their drive's interval
-        self._round: list[J] = []  # jobs without a period, in the order of their turns
+        self._round: list[J] = []  # jobs without a period, in the order of polling
         self._next = 0  # index in `_round` of the next job
-        # bus time that jobs without a period are entitled to; negative: used in advance
+        # bus time that jobs without a period are entitled to; negative if they have used more than that
         self._owed_ns = -CREDIT_NS
         self._is_late = False  # True from a skipped slot until no job is due
         self._kind: Hashable = None  # line settings and silence of the job that was taken last
@@ -248,7 +248,7 @@ class Schedule(Generic[J]):
             self._round.pop(at)
 
     def replace(self, jobs: Sequence[J], others: Sequence[J], due_ns: int) -> None:
-        """Replace `jobs` by `others` in the order of turns. The first slots of `others` start at `due_ns`."""
+        """Replace `jobs` by `others` at the same place in the order; `others` are first due at `due_ns`."""
         rest = self._round[self._next :] + self._round[: self._next]
         at = next((at for at, job in enumerate(rest) if job in jobs), len(rest))
         for job in others:
@@ -284,9 +284,9 @@ class Schedule(Generic[J]):
             self._next = self._round.index(job)
 
     def take(self, now_ns: int, start_ns: int, horizon_ns: int, most: int) -> list[Turn[J]]:
-        """Return the next exchanges in order, at most `most`, that keep the line busy until `horizon_ns`.
+        """Return the next turns (exchanges), at most `most`, to keep the line busy until `horizon_ns`.
 
-        `start_ns` is the time at which the line will have carried out all earlier turns.
+        `start_ns` is the time at which the line will have carried out all earlier exchanges.
         """
         at = idle_since = max(now_ns, start_ns)
         taken: list[Turn[J]] = []
@@ -356,7 +356,7 @@ class Schedule(Generic[J]):
         return min(begun, key=lambda job: (job.kind != self._kind, job.end_ns, job.number))
 
     def _in_turn(self, at_ns: int) -> J | None:
-        """Return a job for time that jobs with a period leave; None if there is none.
+        """Return a job for the time that periodic jobs do not need; None if there is none.
 
         A silent drive whose pause has ended gets its shortest job. Else jobs without a period take turns.
         """
@@ -385,7 +385,7 @@ class Schedule(Generic[J]):
         return not self.back_off.is_paused(job.drive, at_ns) and not self._health[job.drive].is_pending
 
     def _take(self, job: J, at_ns: int) -> Turn[J]:
-        """Return the next exchange of a job. Skip and count the slots of the job that have already ended."""
+        """Return the next exchange of a job. Skip and count the job's slots that have already ended."""
         health = self._health[job.drive]
         health.is_pending = health.is_new
         ready_ns = self._ready.get(job.drive, 0)
@@ -435,7 +435,7 @@ class Schedule(Generic[J]):
         self.unasked += [(job, now_ns) for job in self._round if job.drive == drive]
 
     def pass_slots(self, now_ns: int) -> list[tuple[J, int]]:
-        """Skip every slot that starts by `now_ns`. Return each with its job and its start time."""
+        """Skip every slot that starts by `now_ns`. Return a job and a start time for each skipped slot."""
         while self._begun:
             self._await(self._begun.pop())
         passed = []
@@ -447,5 +447,5 @@ class Schedule(Generic[J]):
         return passed
 
     def pass_all(self, now_ns: int) -> list[tuple[J, int]]:
-        """Skip all due slots, and one turn of each job without a period. Return pairs like `pass_slots`."""
+        """Do the same as `pass_slots`, and also skip each job without a period once."""
         return [*((job, now_ns) for job in self._round), *self.pass_slots(now_ns)]

@@ -104,7 +104,7 @@ _INNER = {"drive": "[[line.drive]]", "channel": "[[line.drive.channel]]"}
 
 
 def check_channels(plant: Plant) -> None:
-    """Raise PlantError with all mistakes in the channels of a plant, which a program may have built."""
+    """Raise PlantError with all mistakes in the channels of a plant."""
     if mistakes := ChannelSet(series_of(plant)).mistakes:
         raise PlantError(tuple(map(str, mistakes)))
 
@@ -126,7 +126,7 @@ def port_or_address(name: Path | str) -> str:
 _URL = re.compile(r"([a-z][a-z0-9+.-]+):/{1,2}(.*)", re.IGNORECASE)
 _PORTS = ("tcp", "socket", "rfc2217")
 
-# JSON Schema of a name and of a port name.
+# JSON Schemas of the names of lines and drives, and of ports
 NAME = {"not": {"enum": [*RESERVED_NAMES]}, "pattern": r"^[^-\x00-\x1f\x7f][^\x00-\x1f\x7f]*$"}
 _HOST = r"(\[[0-9A-Fa-f:.%]+\]|[^@:/?#\[\]]+)"
 _NUMBER = rf":(?!0+([/?#]|$)){PORT_NUMBER}"
@@ -258,7 +258,7 @@ def _line(table: Any, place: TomlPlace) -> PlantLine | None:
 
 
 def _drive(table: Any, line: Mapping[str, Any], place: TomlPlace) -> PolledDrive | None:
-    """Return the drive; None if its entry has a mistake that prevents a stop."""
+    """Return the drive; None if its entry has a mistake, unless it can still be stopped."""
     before = len(place.config_errors)
     model = _model(table, place)
     given = place.check(table, DRIVE_KEYS | _option_keys(model))
@@ -301,7 +301,7 @@ def _channel(table: Any, place: TomlPlace) -> Channel | None:
 
 
 def _check_channels(plant: Plant, given: Mapping[str, Any], place: TomlPlace) -> None:
-    """Add the mistakes in all channels, which may use registers of any drive."""
+    """Add an error to `place` for each mistake in a channel."""
     places = {
         (drive["name"], channel["name"]): at
         for line, at_line in place.inside("line", given.get("line", []))
@@ -359,7 +359,7 @@ def _try_each(
     settings = model(**least).settings
     right = {"baudrate": str(settings.baudrate), "format": f'"{settings.format}"'}
     for key, value in inherited.items():
-        if key not in right:  # `silence` is checked with all other keys when the drive is made
+        if key not in right:  # other keys, such as `silence`, are checked when the drive is created
             continue
         hint = f" (the line's); add {key} = {right[key]} to this drive"
         place.attempt(partial(model, **(least | {key: value})), hint=hint)

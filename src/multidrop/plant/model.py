@@ -176,9 +176,9 @@ class PlantLine:
 
 @dataclass(frozen=True)
 class Plant:
-    """All lines of a plant file, and its table `serve`, which is unchecked and only for the gateway.
+    """All lines of a plant file, and its table `serve`, which only the gateway uses and checks.
 
-    With `realtime`, the thread of the C core runs before all normal threads; see Poller.
+    If `realtime` is True, the thread of the C core gets a realtime priority; see Poller.
     """
 
     lines: Sequence[PlantLine]  # converted to a tuple
@@ -322,8 +322,8 @@ def _of_register(register: Register[Any]) -> dict[str, Any]:
 def allowed(plant: Plant, table: Mapping[str, Any], place: TomlPlace) -> dict[str, frozenset[str]]:
     """Return the registers ("write") and verbs ("verbs") that [serve.may] or [fleet.may] allows.
 
-    Each is given as "drive.name". `table` has checked values of MAY_KEYS. Errors are added to `place`. `stop`
-    is never listed: it is always allowed.
+    Each has the form "drive.name". The keys and types in `table` are already checked. Errors are added to
+    `place`. `stop` is never listed, because it is always allowed.
     """
     found: dict[str, set[str]] = {key: set() for key in MAY_LISTS}
     for key, names in found.items():
@@ -368,7 +368,7 @@ def _listed(plant: Plant, key: str, entry: object) -> list[str]:
 
 
 def _entry(key: str, drive: Drive, name: object) -> str:
-    """Return "drive.name". Raises ValueError if it is impossible to allow this register or verb."""
+    """Return "DRIVE.NAME" of a register or verb. Raises ValueError if it cannot be allowed."""
     entry = f"{drive.name}.{name}"
     if key == "write":
         try:
@@ -381,9 +381,7 @@ def _entry(key: str, drive: Drive, name: object) -> str:
     verbs = [verb for verb in verbs_of(drive) if verb in LISTED_VERBS]
     if name not in verbs:
         known = ", ".join(verbs) or "none"
-        raise ValueError(
-            f"{key}: {name!r} of {drive.name} is not a verb that can be listed here; choose from {known}"
-        )
+        raise ValueError(f"{key}: {name!r} of {drive.name} cannot be allowed; choose from {known}")
     return entry
 
 
@@ -500,7 +498,9 @@ def _showing_faults(plant: Plant) -> list[str]:
         polled.drive.name for polled in plant.drives if FAULT in [poll.register.name for poll in polled.polls]
     ]
     if not found:
-        raise ValueError(f"{FAULT}: no drive polls a register {FAULT!r}; write a condition")
+        raise ValueError(
+            f"{FAULT}: no drive polls a register {FAULT!r}; give a condition as the trigger instead"
+        )
     return found
 
 

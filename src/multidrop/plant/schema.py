@@ -56,7 +56,7 @@ def _allowed(model: str, table: str, number: int) -> dict[str, Any]:
 
 
 def _lists_of(model: str, families: _Families) -> dict[str, Any]:
-    """Return the schema for plant files whose table `may.family` names this model."""
+    """Return the schema for plant files that allow registers or verbs of all drives of this model."""
     names = [name for name, family in families.items() if family.model == model]
     family = families[names[0]]
     writable = [register.name for register in family.registers.values() if register.writable]
@@ -130,7 +130,7 @@ def _facts(**values: list[str]) -> dict[str, Any]:
 
 
 def _using(name: str, family: type[Drive], framing: Framing) -> list[dict[str, Any]]:
-    """Return the conditions under which a drive of this family has this framing."""
+    """Return the schemas that match the table of a drive of this family with this framing."""
     stated = _facts(model=[name], framing=_spellings(framing))
     by_default = _facts(model=[name]) | _without("framing")
     return [stated, by_default] if framing is family.framings[0] else [stated]
@@ -141,7 +141,10 @@ _SLOW = 15_000  # bit/s; up to this baud rate, 1.5 characters take 1 ms or more
 
 
 def _short_silences(families: _Families) -> list[dict[str, Any]]:
-    """Return the parts of the schema for a silence below 1 ms: slow RTU drives need 1.5 characters."""
+    """Return the parts of the schema that refuse a silence below 1 ms for slow RTU drives.
+
+    Their silence must last at least 1.5 characters.
+    """
     is_short = {"properties": {"silence": {"pattern": _SHORT}}, "required": ["silence"]}
     is_slow = {"properties": {"baudrate": {"maximum": _SLOW}}, "required": ["baudrate"]}
     needs_baudrate = {"required": ["baudrate"]}
@@ -231,7 +234,7 @@ def _used(name: str) -> dict[str, Any]:
 
 
 def _integrals(families: _Families) -> Iterator[dict[str, Any]]:
-    """Yield the parts of the schema for the unit of a channel whose value is `integral(register)`."""
+    """Yield the parts of the schema that check the units of channels such as `integral(power)`."""
     models: dict[tuple[str, str], list[str]] = {}
     for model, family in families.items():
         for register in family.readings():

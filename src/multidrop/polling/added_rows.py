@@ -70,9 +70,9 @@ class AddedRows:
         self._names = names
         self._lock = threading.RLock()  # reentrant: a signal handler may close the poller during `take`
         self._channels = ChannelSet(())
-        # the codes of the drive and the register of each input slot
+        # codes of a drive and its register, by input slot (index of a register that channels use)
         self._codes: dict[int, tuple[int, int]] = {}
-        # input slots of the registers that channels use, by (code of the drive, code of the register)
+        # input slots, by the codes of the drive and the register
         self._slots: dict[tuple[int, int], int] = {}
         # the newest drive of each name; weak: a drive that was removed must not stay in memory
         self._drives: dict[str, ref[Drive]] = {}

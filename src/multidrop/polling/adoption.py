@@ -137,11 +137,11 @@ class KeptLine:
                 self.line.await_gone(drive.address)
 
     def is_free(self, leaving: Mapping[str, KeptLine]) -> bool:
-        """Return False if a drive that joins has the name of a drive that has not left another line yet."""
+        """Return True if no drive on another line still has the name of a drive that this line gets."""
         return all(leaving.get(polled.drive.name, self) is self for polled in self.joining)
 
     def take_in(self) -> None:
-        """Start polling the drives that join, and the changed registers and rates of drives that stay.
+        """Start polling the line's new drives, and change the polled registers and rates of the others.
 
         Raises LineError if the port does not support a drive's settings.
         """
@@ -163,7 +163,7 @@ class NewLine:
 
 
 class Adoption:
-    """A change of a poller's lines to another plant. Raises ValueError for a mistake in the plant."""
+    """The change of a poller to another plant. Raises ValueError for a mistake in the plant."""
 
     def __init__(self, lines: LineSet, plant: Plant) -> None:
         self._lines = lines
@@ -235,11 +235,12 @@ class Adoption:
         self._lines.let_go(self._removed, GONE)
 
     def _change(self) -> dict[str, LineError]:
-        """Change the kept lines one by one; return the errors of ports, by line name.
+        """Change the lines that keep their ports, one by one; return the errors of ports, by line name.
 
-        If a drive that joins a line has the name of a drive that leaves another line, the other line is
-        changed first. If lines wait for each other in a circle, all of them are changed together, after their
-        stops have ended. New ports are opened later, because a slow port must not delay a stop.
+        A drive name must be free before a line gets a new drive of this name. Therefore a line from which a
+        drive of this name is removed is changed earlier. If lines wait for each other in a circle, all of
+        them are changed together, after their stops have ended. New ports are opened later, because a slow
+        port must not delay a stop.
         """
         failures: dict[str, LineError] = {}
         names = {polled.drive.name for polled in self._plant.drives}

@@ -51,7 +51,7 @@ def nanoarrow() -> Any:
         return importlib.import_module("nanoarrow")
     except ImportError as failure:
         raise ImportError(
-            "rows in Arrow's layout, such as those of a recording that is read, need nanoarrow, which is not "
+            "rows in Arrow's layout, such as the rows of a recording, need nanoarrow, which is not "
             "installed: pip install nanoarrow",
             name="nanoarrow",
         ) from failure
@@ -221,7 +221,7 @@ def _check_chosen(chosen: Sequence[str], known: set[str]) -> None:
 
 
 _STATUSES = Names(STATUSES)  # the core's status texts, followed by the texts of events
-MOST_STATUSES = 1 << 14  # limit of the different status texts in one process
+MOST_STATUSES = 1 << 14  # limit of the number of different status texts in one process
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
@@ -283,7 +283,7 @@ class BatchColumns(NamedTuple):
 
 
 def slot_rows(columns: BatchColumns, slots: Mapping[tuple[int, int], int]) -> Iterator[SlotRow]:
-    """Yield the rows of registers in `slots`, which maps their codes (drive, register) to slot numbers."""
+    """Yield the rows of some registers. `slots` has their indexes by the codes of drive and register."""
     for at in find_codes(columns.drive, columns.register, slots):
         yield SlotRow(
             slots[columns.drive[at], columns.register[at]],

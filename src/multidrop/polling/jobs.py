@@ -34,8 +34,8 @@ class RowNames:
         for names, of in ((of_drives, "drives"), (of_registers, "registers")):
             if len(names) > MOST_NAMES:
                 raise ValueError(
-                    f"a poller uses at most {MOST_NAMES} names of {of} while it runs; this poller would use "
-                    f"{len(names)}; start another poller"
+                    f"a poller can have at most {MOST_NAMES} different names of {of} during its life; this "
+                    f"poller would have {len(names)}; start another poller"
                 )
 
     def layout(self, drive: Drive, block: Block) -> RowLayout:
@@ -82,7 +82,7 @@ class JobMaker:
         self._bus = bus
         self._names = names
         self._made: dict[tuple[Drive, Block, int | None], PolledJob] = {}
-        # A layout counts the refusals of its block, so jobs that read a block at different rates share it.
+        # Jobs that read a block at different rates share its layout, because the layout counts the refusals.
         self._rows: dict[tuple[Drive, Block], RowLayout] = {}
         self._skipped = 0  # number of polls that were skipped by jobs which are forgotten now
 
@@ -160,10 +160,10 @@ Slot = tuple[PolledJob, int]  # a job, and the time in ns at which it was due
 
 
 class PortQueue:
-    """The exchanges of a schedule's jobs on the currently open port, either queued ahead or repeated.
+    """Keeps the currently open port busy with the exchanges of the schedule's jobs.
 
-    If all drives of a line answer and are polled as fast as possible, the core repeats the bus cycle by
-    itself. Otherwise the queue is refilled with many exchanges at a time.
+    If all drives of a line answer and are polled as fast as possible, the C core gets the bus cycle once and
+    repeats it. Otherwise many exchanges at a time are put into the core's queue.
     """
 
     def __init__(self, schedule: Schedule[PolledJob]) -> None:
@@ -215,7 +215,7 @@ class PortQueue:
             self._cycle = []
 
     def abandon(self) -> None:
-        """Forget the port and stop its repeating; queued exchanges are still carried out."""
+        """Forget the port and end the repeated bus cycle; queued exchanges are still carried out."""
         port, self.port = self.port, None
         self._queued.clear()
         self._cycle = []

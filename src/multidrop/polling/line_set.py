@@ -45,7 +45,7 @@ class LineSet:
         self.stops_on_exit = False  # True if `stop_on_exit` applies, also to lines added later
         self._lines: tuple[PolledLine, ...] = ()  # replaced, never mutated: readers iterate without a lock
         self._numbered: dict[int, PolledLine] = {}
-        self._free: list[int] = []  # numbers of removed lines
+        self._free: list[int] = []  # line numbers for reuse, from removed lines
 
     def __iter__(self) -> Iterator[PolledLine]:
         return iter(self._lines)
@@ -141,7 +141,7 @@ class LineSet:
             if self._mastership and not self._mastership.holds:
                 return self.await_port(line)
             return self._bus(Bus, line)
-        except OSError as failure:  # of the port (LineError) or of the audit log
+        except OSError as failure:  # an error of the port (LineError) or of the audit log
             return failure
 
     def await_port(self, line: PlantLine) -> Bus:
@@ -213,8 +213,8 @@ class LineSet:
         """Stop polling these lines, and wait for stops and exchanges in flight.
 
         Drives whose bus has `stop_on_exit` are stopped first. The wait for stops has no limit. The wait for
-        exchanges in flight ends after ENDING_NS, or earlier when the mastership expires. If ports are still
-        open half a guard time after that, the kernel kills the process.
+        exchanges in flight ends after ENDING_NS, or earlier when the mastership expires. If ports stay open
+        too long after the expiry, a timer of the operating system kills the process; see Mastership.
         """
         for line in lines:
             line.bus.leave()  # starts the stops of all lines; the next loop waits for them

@@ -44,7 +44,7 @@ class Reopening:
         return self._thread is not None and self._thread.is_alive()
 
     def begin(self) -> None:
-        """Start an attempt to reopen the port. If no thread can be started, stops reopen it themselves."""
+        """Reopen the port on another thread. If none can be started, each stop reopens the port itself."""
         thread = threading.Thread(target=self._attempt, name="multidrop reopening", daemon=True)
         self._thread = None
         self._bus.note_reopening(True)
@@ -104,10 +104,10 @@ def _drive_summary(drive: Statistics, response_delay: float) -> dict[str, Any]:
 
 
 LEARN_NS = 1_000_000_000  # interval at which durations and plans are adapted to measured response delays
-RELEARN_NS = 2_000_000_000  # the same, while the core repeats the bus cycle by itself
+RELEARN_NS = 2_000_000_000  # the same interval while the C core repeats a bus cycle
 REOPEN_NS = 500_000_000  # interval between attempts to reopen a lost port
-# A lost port is reopened immediately, unless it was lost more often than this without a reply in between.
-# The limit is above one, because some devices close each connection at one particular request.
+# After this many losses of a port without a reply in between, the next loss is followed by a pause. The
+# number is above 1, because some devices close each connection at one particular request.
 MOST_AT_ONCE = 2
 # time after the reopening of a lost port during which the requests of stops go before polls
 STOPS_FIRST_NS = 500_000_000
@@ -116,8 +116,8 @@ STANDBY_NS = 500_000_000
 RETRY_NS = 500_000_000  # pause before polling is retried after a failure; each further failure doubles it
 LONGEST_RETRY_NS = 30_000_000_000
 SOUND_NS = 10_000_000_000  # time without failures of polling after which earlier failures are forgotten
-# A drive's requests are planned again if its response delay is outside the range of delays for which the plan
-# is the quickest. This is the relative tolerance of that range.
+# A plan of requests is the quickest one only for a range of response delays. A drive's requests are planned
+# again if its delay leaves this range by more than this fraction.
 MARGIN = 0.05
 
 
@@ -155,7 +155,8 @@ class PolledLine:
         self._observed: list[tuple[int, int, bool]] = []
         self._is_started = False
         self._learnt_ns = 0
-        # After reopening, send the next request at once: some servers close a connection that stays idle.
+        # Once the port is reopened, the poller's thread is called to send a request immediately, because some
+        # servers close an idle connection.
         self._reopening = Reopening(bus, lambda: row_queue.call(number))
         self._lost_ns = 0  # when the port was lost; 0 if a drive has answered since
         self._losses = 0  # number of losses since a drive answered
@@ -264,7 +265,7 @@ class PolledLine:
         self._row_queue.call(self.number)
 
     def forget(self, drive: Drive) -> None:
-        """Forget the jobs of a drive that was removed for good, but keep its timing and late replies."""
+        """Forget the jobs of a removed drive. Its measured delays are kept; its late replies are awaited."""
         with self._lock:
             self._planned = {each: jobs for each, jobs in self._planned.items() if each.drive is not drive}
             self._maker.forget_drive(drive)
@@ -272,15 +273,15 @@ class PolledLine:
     def set_rate(self, drive: Drive, register: Register[Any] | None, every: float | None) -> None:
         """Set the period `every` in s of a polled register, or of all polled registers if `register` is None.
 
-        `every` None means as fast as possible. Registers whose rate is unchanged keep their slots. At a new
-        rate, the first slot is now. Raises ValueError for a register that is not polled.
+        `every` None means as fast as possible. Registers whose rate is unchanged are polled at the planned
+        times. Registers with a new rate are polled now. Raises ValueError for a register that is not polled.
         """
         with self._lock:
             after = self._present[drive].at_rate(register, every)
         self.set_polls(after)
 
     def set_polls(self, after: PolledDrive) -> None:
-        """Change the polled registers or the rates of a present drive; unchanged polls keep their slots."""
+        """Change a drive's polled registers or rates; the other registers are polled at the planned times."""
         with self._lock:
             drive = after.drive
             before = self._present[drive]
@@ -305,8 +306,8 @@ class PolledLine:
         """
         present = self._jobs(drive)
         old = [job for job in present if job not in wanted]
-        # The first due time of new jobs, by period: that of the earliest old job with this period. If there
-        # is no such job, it is that of the earliest present job.
+        # New jobs are first due when the earliest replaced job with the same period would have been due. If
+        # no job with this period is replaced, they are due with the earliest other job.
         latest_first = [*sorted(present, key=_due, reverse=True), *sorted(old, key=_due, reverse=True)]
         dues = {job.period_ns: job.due_ns for job in latest_first}
         self._refusals.forget(drive)
@@ -353,7 +354,8 @@ class PolledLine:
         Never raises. A failure, such as one in a user's own class, is logged, and polling is retried later.
         Until then the line's rows have no values, and the status POLLING_FAILED.
         """
-        if self._is_left:  # `close` may hold the lock until the port is closed
+        # no lock is taken for a line that is being closed, because `close` may hold the lock for long
+        if self._is_left:
             return
         try:
             self._tend(now_ns)
@@ -431,10 +433,10 @@ class PolledLine:
             self._miss_unasked(now_ns)
 
     def _leaves_port_to_stops(self, now_ns: int) -> bool:
-        """Return True just after a lost port was reopened, while stops are repeated.
+        """Return True shortly after a lost port was reopened, if stops are in progress.
 
-        Some servers close the connection after each reply. If the first request were a poll, a stop that
-        waits for its reply would never be sent.
+        Some servers close the connection after each reply. If a poll were the first request on each
+        connection, the stop would never be sent.
         """
         is_new = self._lost_ns > 0 and now_ns < self._opened_ns + STOPS_FIRST_NS
         return is_new and bool(self.bus.stops_under_way())
@@ -481,7 +483,7 @@ class PolledLine:
                 self._row_queue.add_miss(job.rows, why, due_ns)
 
     def _miss_unasked(self, now_ns: int) -> None:
-        """Add rows without a value for skipped slots that are now due; slots may be skipped in advance."""
+        """Add a row without a value for each poll of a silent drive that was skipped and is due by now."""
         unasked = self._schedule.unasked
         if unasked:
             self._miss([slot for slot in unasked if slot[1] <= now_ns], Status.NOT_ASKED)

@@ -37,7 +37,7 @@ class Refusals:
         self._maker = maker
         # the scheduled jobs with the long period SET_ASIDE_NS -> the normal jobs that they replace
         self._set_aside: dict[PolledJob, PolledJob] = {}
-        # normal jobs -> the jobs with the long period that were made for them; kept for reuse
+        # normal jobs -> the jobs that replace them with the long period; kept for reuse
         self._rare: dict[PolledJob, PolledJob] = {}
         # for each part of a split job: the whole job as planned
         self._wholes: dict[PolledJob, PolledJob] = {}
@@ -59,7 +59,7 @@ class Refusals:
             self._make_whole(trial, now_ns)
         for rare in [rare for rare in self._set_aside if not rare.rows.refusals]:
             job = self._set_aside.pop(rare)
-            # the reply that was in flight when the job was set aside may have been a refusal
+            # Start counting again: a reply that came after the job was set aside may have been a refusal.
             job.rows.refusals = 0
             self._schedule.replace([rare], [job], now_ns)
         for job in [job for job in self._schedule.jobs if self._is_refused(job)]:
@@ -74,9 +74,9 @@ class Refusals:
             self._end_probes()
 
     def _is_refused(self, job: PolledJob) -> bool:
-        """Return True if a job has had too many exceptions in a row, and must be split or set aside.
+        """Return True if a job's block was refused too often in a row.
 
-        The limit is REFUSALS, but only 1 for a part of a split block, if the part has several registers.
+        The limit is REFUSALS. For a part of a split block with several registers, it is 1.
         """
         count = job.rows.refusals
         if not count or job in self._trials or job is self._probes.get(job.drive):
@@ -127,7 +127,11 @@ class Refusals:
     # ---- silence ----
 
     def _split_unanswered(self, job: PolledJob, now_ns: int) -> None:
-        """Split a block that may be too long and stays unanswered, if the drive answers other requests."""
+        """Split a block that stays unanswered and may be too long.
+
+        This is only done if the drive answers other requests. If all its blocks may be too long, it first
+        gets a request for a single register.
+        """
         peer, drive = job.exchange.peer, job.owner
         if job.rows.is_answered or job in self._trials:
             return
@@ -141,7 +145,7 @@ class Refusals:
                 self._schedule.add(probe, now_ns)
 
     def _end_probes(self) -> None:
-        """Remove the single-register jobs of drives without an unanswered block that may be too long."""
+        """Remove the jobs in `_probes` of drives that now answer all blocks."""
         doubtful = {
             job.drive for job in self._schedule.jobs if job.may_be_too_long and not job.rows.is_answered
         }

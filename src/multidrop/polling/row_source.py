@@ -76,7 +76,7 @@ class BatchCaller:
             _log.error("on_batch: the function failed and is no longer called", exc_info=failure)
 
     def join(self) -> None:
-        """Wait until the call with the last batch has returned, unless the function itself calls this."""
+        """Wait until the user's function has returned from the last call. Called by it, return at once."""
         if threading.current_thread() is not self._thread:
             self._thread.join()
 
@@ -125,7 +125,7 @@ class WakeUp:
 FILLING_NS = 10_000_000  # minimum interval between two batches that are taken from a chunk that is not full
 BATCHES_S = 0.1  # interval between checks for rows in `batches` and `on_batch`
 ASYNC_LOOK_S = 0.05  # interval between checks for rows in `async for`
-PROMPT_S = 0.02  # interval between these checks if realtime scheduling was granted
+PROMPT_S = 0.02  # interval between checks for rows if realtime scheduling was granted
 
 
 class RowSource:
@@ -138,7 +138,7 @@ class RowSource:
         self._added = AddedRows(names)  # adds the rows of computed channels and of events
         self._wakeup = WakeUp()
         self._is_watched = False  # True once `fileno` was called: `_wakeup` must then show whether rows wait
-        self._taken_ns = 0  # when rows were last taken from a chunk that was not full
+        self._taken_ns = 0  # when `take` last took a chunk of rows that was not full; see FILLING_NS
         self._is_started = False  # True once polling has started
         self._closing = False
         self._over = threading.Event()  # set once all lines are closed, so that no further rows come
@@ -198,7 +198,7 @@ class RowSource:
         `every` None means 0.1 s, or 0.02 s if realtime scheduling was granted.
 
         Once the poller is closed, the remaining batches are yielded immediately. Raises PollingFailed like
-        `take`, and ValueError before the `with` block, because no rows would come.
+        `take`. Raises ValueError if polling has not started, which the poller's `with` block does.
         """
         self._check_started()
         return self._yield_batches(seconds, every)

@@ -53,9 +53,9 @@ def check_step(step: RunStep, plant: Plant) -> None:
 
 
 def _rehearse(script: Any, *arguments: Any) -> Any:
-    """Return the first step of a verb's script; nothing is sent.
+    """Return the first step of a command's script, such as a write; nothing is sent.
 
-    Raises ValueError if the family lacks or forbids the verb.
+    Raises ValueError if the drive does not have this command, or if it may not be sent.
     """
     try:
         return next(script(*arguments))
@@ -64,7 +64,7 @@ def _rehearse(script: Any, *arguments: Any) -> Any:
 
 
 def check_stop(drive: Drive) -> None:
-    """Raise ValueError if the family has no stop."""
+    """Raise ValueError if the drive has no stop command."""
     _rehearse(drive.stop.script)
 
 
@@ -133,9 +133,9 @@ def _lines(plan: RunPlan) -> list[_LineTime]:
 
 
 def longest_pause(plan: RunPlan) -> float:
-    """Return the longest planned time in s between two values that the test needs.
+    """Return the longest planned time in s between two values of a series that the run needs.
 
-    It needs any value of each of its drives, a value of each register in a condition, and each fault code.
+    The run needs each register in a condition, each fault code, and at least one register of each drive.
     """
     compared = {*plan.faults, *((condition.drive, condition.register) for condition in plan.conditions)}
     pauses = [one.prediction.cycle for one in _lines(plan)]

@@ -201,7 +201,7 @@ def _check_keys(given: Mapping[str, Any], step: RunStep, place: TomlPlace) -> No
 def _each(frequency: Mapping[str, Any], place: TomlPlace) -> Iterator[dict[str, float]]:
     """Yield the frequencies of all drives for each step.
 
-    The key has a list for each drive, with one number per step, or a single number for all steps.
+    `frequency` has a list for each drive, with one number per step, or a single number for all steps.
     """
     lists = {name: one if isinstance(one, list) else [one] for name, one in frequency.items()}
     for name, numbers in lists.items():

@@ -110,7 +110,7 @@ class RunStep:
     def __post_init__(self) -> None:
         # an infinite time would never end the step
         if not (0 <= self.dwell < inf and 0 <= self.within < inf):
-            raise ValueError(f"{self.name}: dwell and within must be 0 s or more, and finite")
+            raise ValueError(f"{self.name}: `dwell` and `within` must be finite times of 0 s or more")
 
     @property
     def drives(self) -> tuple[str, ...]:
@@ -153,13 +153,13 @@ class RunPlan:
 
     @property
     def drives(self) -> tuple[str, ...]:
-        """The names of the drives that the test commands or whose values it compares."""
+        """The names of the drives that get commands, and of those with a register in a condition."""
         compared = (condition.drive for condition in self.conditions)
         return tuple(dict.fromkeys([*self.commanded, *compared]))
 
     @property
     def faults(self) -> tuple[tuple[str, str], ...]:
-        """The (drive, register) of each polled fault code of the test's drives."""
+        """The (drive, register) of each polled fault code of the drives in `drives`."""
         polls = ((name, poll) for name in self.drives for poll in polled_drive(self.plant, name).polls)
         return tuple((name, FAULT) for name, poll in polls if poll.register.name == FAULT)
 
@@ -172,8 +172,8 @@ class RunPlan:
 class PlannedStep:
     """A step with its planned start, in s after the run's start, and its length in s.
 
-    The length does not include the wait for `until`. `is_latest` is True if the step may start earlier than
-    at `begin`, because an earlier step waits for a condition.
+    The length does not include the time until the step's condition `until` holds. If an earlier step waits
+    for a condition, `begin` is the latest possible start, and `is_latest` is True.
     """
 
     step: RunStep
@@ -229,7 +229,7 @@ class LimitWatch:
         self._drives = {name: polled_drive(plan.plant, name) for name in plan.drives}
         self._readers = {name: StateReader(polled.drive) for name, polled in self._drives.items()}
         self._newest: dict[str, dict[str, Row]] = {name: {} for name in self._drives}
-        # newest value of each fault record, by drive and register
+        # newest value of each register that stores a past fault, such as `last_fault`, by drive and register
         self._records: dict[tuple[str, str], float] = {}
         # monotonic times in ns of the newest values, by drive name and by "drive.register"
         self._heard = dict.fromkeys(self._drives, begin_ns)
@@ -265,8 +265,8 @@ class LimitWatch:
         return register.format(register.decode(row.value) if register.values is not None else row.value)
 
     def _is_new_fault(self, drive: str, register: str, value: float) -> bool:
-        """Return True if the value shows a new fault in a fault record, such as `last_fault`."""
-        # the first value of a record does not count, because its fault may be old
+        """Return True if the value is a new fault in a register of past faults, such as `last_fault`."""
+        # the first value does not count, because the fault may be old
         if register not in FAULT_RECORDS:
             return False
         before = self._records.get((drive, register), value)

@@ -43,7 +43,8 @@ SHORTEST_S = 1e-4  # shortest period of a polled register, in s
 MOST_WAITING = 3000  # limit of batches (30 s or more) that wait for the recording or for a callback
 # On a busy computer, a simulated drive may reply after the timeout.
 SIMULATED_ATTEMPTS = 20  # limit of attempts to check or command a simulated drive
-SIMULATED_SILENCE_S = 60.0  # the smallest default of `silence` if all lines are simulated
+# If all lines are simulated, the default of the limit `silence` is at least this, in s.
+SIMULATED_SILENCE_S = 60.0
 ENDING_S = 10.0  # time in s that the end of a run waits for the recording and for each callback
 
 
@@ -99,7 +100,7 @@ class TestRun:
         self._phases = [*dict.fromkeys([*(step.name for step in self.plan.steps), STOP])]
 
     def misfits(self) -> list[str]:
-        """Return a sentence for each part of the test that is too fast for its line, with a fitting value."""
+        """Return a sentence for each time in the test that is too short for its line, and a longer time."""
         return misfits(self.plan)
 
     @property
@@ -253,7 +254,7 @@ class _Session:
     def _end_rows(self) -> list[str]:
         """Pass on the last rows and close the recording.
 
-        Return an error sentence for each receiver, the recording or a callback, that did not get all rows.
+        Return an error sentence for each recording and callback that did not get all rows.
         """
         while self.take():  # pass on the rows that arrived while the poller was being closed
             pass
@@ -312,7 +313,7 @@ class _Session:
             self._look(commands)
             now = self._run.elapsed
             is_done = all(command.done() for command in commands)
-            is_late |= now >= end + LATE_S * self._run._speed  # for example on a busy computer
+            is_late |= now >= end + LATE_S * self._run._speed
             if now >= end and is_done:
                 if until is None:
                     return now if is_late else end
@@ -335,7 +336,7 @@ class _Session:
         self._raise_failure()
         if slow := next((thread for thread in self._row_threads if thread.has_lost), None):
             raise _Aborted(f"more than {MOST_WAITING} batches waited for {slow.name}")
-        # the time that the computer slept counts too, so that a run does not continue after a sleep
+        # Sleep of the computer during the run counts as silence, so that the run does not continue after it.
         if why := self._watch.silent(clock.boottime_ns() - self._slept_ns):
             raise _Aborted(why)
         duration = self._plan.limits.duration
@@ -357,7 +358,7 @@ class _Session:
         self._looked_ns = now_ns
 
     def _limit_ns(self) -> float:
-        """Return the time in ns (CLOCK_MONOTONIC) from which on the run counts as standing still."""
+        """Return the time in ns (CLOCK_MONOTONIC) by which rows must be compared again."""
         left_ns: float = self._looked_ns + STILL_S * 1e9 - clock.boottime_ns()
         return clock.now_ns() + left_ns
 

@@ -66,7 +66,7 @@ TROUBLE = {  # the faults that some drives of the demo simulate
 DRIFT = 0.25  # each simulated load moves up and down by this fraction of the rated torque
 FIRST_STEP_S = 0.5  # pause between the first starts of a line's motors
 STEP_S = 0.8  # pause before the operator turns to the next drive of a line
-CALM = 3  # when the operator visits a running motor, one visit in CALM changes the setpoint, on average
+CALM = 3  # the operator changes a running motor's setpoint with a probability of 1 / CALM
 
 
 def demo_files(folder: Path) -> tuple[Path, Path]:
@@ -93,7 +93,7 @@ def _plant_tables(folder: Path) -> Iterator[str]:
 
 
 def _polled(family: type[Drive]) -> Iterator[str]:
-    """Yield the entries of a drive's key `poll`: registers whose values have a name or a unit."""
+    """Yield the entries of the list `poll` in a plant file, for registers with a unit or named values."""
     entries = {
         '"{}"': POLLED_OF.get(family.model, POLLED),
         f'{{{{ register = "{{}}", every = "{SLOW}" }}}}': SLOWLY,

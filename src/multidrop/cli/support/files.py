@@ -51,7 +51,7 @@ def check_capture(path: Path) -> None:
 
 
 def require_extra(library: str, extra: str, command: str) -> None:
-    """Raise ValueError if the library is missing. Its message has the command that installs the extra."""
+    """Raise ValueError if the library is missing; the message says how to install it."""
     if importlib.util.find_spec(library) is None:
         raise ValueError(
             f"`multidrop {command}` needs {library}, which is not installed: {install_command(extra)}"

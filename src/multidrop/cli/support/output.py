@@ -126,10 +126,10 @@ def _drop_typed_input() -> None:
 
 @contextmanager
 def reporting_interruption(drive: Drive, command: str) -> Iterator[list[str]]:
-    """On Ctrl-C, add notes about the requests sent so far, also while the port is being opened or closed.
+    """If Ctrl-C ends the block, add notes to the KeyboardInterrupt about the requests sent so far.
 
-    Yields the list of notes. At first it says that no request was sent; the caller replaces its contents. If
-    another failure was being handled when Ctrl-C came, that failure is added to the notes.
+    Yields the list of these notes. At first it says that no request was sent; the caller replaces its
+    contents. If Ctrl-C came during the handling of a BusError, that error becomes a note too.
     """
     known = [f"{drive.name}: the {command} was not sent"]
     try:

@@ -102,7 +102,7 @@ def polling_session(
                     try:
                         take(batch)
                     except BaseException:
-                        # this consumer failed: without this batch, its recording would have a hole
+                        # The consumer failed and lacks this batch, so it gets no further batches.
                         takers.remove(take)
                         raise
 
@@ -146,7 +146,7 @@ class LiveDrive:
     newest: dict[str, Row] = field(default_factory=dict)  # each register's newest sample
     # each register's last missed value, if newer than its newest sample
     missed: dict[str, Row] = field(default_factory=dict)
-    last_miss: str = ""  # status of the last missed value whose request was sent
+    last_miss: str = ""  # status of the last value that was requested but not received
     so_far: Statistics = _NOTHING
     recent: Statistics = _NOTHING
     history: deque[float | None] = field(default_factory=lambda: deque(maxlen=HISTORY))
@@ -211,7 +211,7 @@ class LiveDrive:
 
     @property
     def state(self) -> str:
-        """Return the drive's state in a word, as far as the polled registers show it."""
+        """Return the drive's state as a short text such as "fault"; "" if no polled register shows it."""
         register = self.state_register
         if register in (STATE, FREQUENCY) and (known := self._known_state()):
             return known
@@ -246,10 +246,10 @@ class LiveDrive:
 
 
 class LivePlant:
-    """All drives of a plant, and the statistics of its lines: so far, and of the last RECENT seconds.
+    """All drives of a plant, with statistics of its lines since the start and in the last RECENT seconds.
 
-    Rows, statistics and times are arguments, so the class reads no clock. A screen that marks old values
-    passes `plant.metadata()["planned"]` as `planned`.
+    Rows, statistics and times are arguments, so the class reads no clock. `planned` has the planned cycle
+    time of each line, from `plant.metadata()["planned"]`; it is needed to mark old values.
     """
 
     def __init__(self, plant: Plant, planned: Mapping[str, Any] | None = None) -> None:

@@ -120,8 +120,8 @@ def sparkline(
     None and values beyond LARGEST, such as infinity, are blanks.
 
     If the history has more points than columns, each column shows the mean of several points. `points` is the
-    number of points recorded so far, including those that the history has dropped. With it, points that share
-    a column in one picture also share a column in the next.
+    number of points recorded so far, including those that the history has dropped. If it is given, later
+    drawings average the same groups of points.
     """
     values = list(history)
     share = max(1, ceil(len(values) / width)) if width > 0 else 0

@@ -16,7 +16,7 @@ from multidrop.drive.register import Register, chosen_language, unnamed_bits
 
 Row = Sequence[str]
 T = TypeVar("T", bound=float)
-WIDTH = 80  # characters of a line
+WIDTH = 80  # limit of characters in a wrapped line of text
 # limit of a name's width in columns; longer names are shortened so that tables fit a terminal
 LONGEST_NAME = 24
 _PRECISIONS = {NumberFormat.F16: "half", NumberFormat.F32: "single", NumberFormat.F64: "double"}
