@@ -36,15 +36,15 @@ class ModbusDevice(Drive):
     """A Modbus device without a declared family, whose tables are read and written by address.
 
     Addresses are those on the wire, from 0. Numbers have the formats of family files ("U16" to "F64") and the
-    byte orders "ABCD", "CDAB", "BADC" and "DCBA". As for drives of a family, the library keeps silences,
-    retries reads, detects late replies, and records writes in the audit log. A write needs `confirm=True`,
-    because it may start a motor.
+    byte orders "ABCD", "CDAB", "BADC" and "DCBA". As for other drives, the library waits for the
+    silence between frames, retries reads, detects late replies, and records writes in the audit log. A write
+    needs `confirm=True`, because it may start a motor.
     """
 
     title = "Modbus device"
     framings = (Framing.RTU, Framing.ASCII)
     addresses = range(256)
-    has_motor = False  # for each write, the user confirms that it cannot start a motor
+    has_motor = False  # assumed: the user confirms for each write that it starts no motor
     response_timeout = 1.0
 
     def read_holding(
@@ -60,21 +60,25 @@ class ModbusDevice(Drive):
     def read_input(
         self, start: int, count: int = 1, format: Format = "U16", *, order: Order = "ABCD"
     ) -> list[float]:
-        """Return `count` numbers from the input registers that start at `start`; raises as `read_holding`."""
+        """Return `count` numbers from the input registers that start at address `start`.
+
+        Raises the errors of `read_holding`.
+        """
         return self._numbers(4, "input register", start, count, format, order)
 
     def read_coils(self, start: int, count: int = 1) -> list[bool]:
-        """Return `count` coils from `start`; raises as `read_holding`."""
+        """Return `count` coils from address `start`. Raises the errors of `read_holding`."""
         return self._bits(1, start, count)
 
     def read_discrete(self, start: int, count: int = 1) -> list[bool]:
-        """Return `count` discrete inputs from `start`; raises as `read_holding`."""
+        """Return `count` discrete inputs from address `start`. Raises the errors of `read_holding`."""
         return self._bits(2, start, count)
 
     def read_identification(self) -> dict[int, bytes]:
         """Return the device's basic identification by function 43: its objects by number.
 
-        Object 0 is the vendor's name, 1 the product code, and 2 the revision. Raises as `read_holding`.
+        Object 0 is the vendor's name, 1 the product code, and 2 the revision. Raises the errors of
+        `read_holding`.
         """
         found: dict[int, bytes] = {}
         first = 0
@@ -98,10 +102,11 @@ class ModbusDevice(Drive):
     ) -> list[float]:
         """Write a number or several to the holding registers from `start`; return what the device then holds.
 
-        One register is written by function 6, several by function 16, which `multiple` uses for one register
-        too. The registers are then read back; if the device refuses that read, the written numbers are
-        returned. Raises WriteForbidden without `confirm=True`, and ValueError for a number that does not fit.
-        Raises NotVerified if the device holds other numbers, and Unconfirmed if the write may have happened.
+        One register is written by function 6, several by function 16. With `multiple`, function 16 also
+        writes one register. The registers are then read back; if the device refuses that read, the written
+        numbers are returned. Raises WriteForbidden without `confirm=True`, and ValueError for a number that
+        does not fit. Raises NotVerified if the device holds other numbers, and Unconfirmed if the write may
+        have happened.
         """
         coding = _coding(format, order)
         numbers = values if isinstance(values, Sequence) else [values]
@@ -122,8 +127,9 @@ class ModbusDevice(Drive):
     def mask_holding(self, start: int, and_mask: int, or_mask: int, *, confirm: bool = False) -> int:
         """Set bits of the holding register `start`; return the number that the device then holds.
 
-        By function 22 the device keeps the bits of `and_mask`, and sets the others as in `or_mask`. Raises as
-        `write_holding`, and Unconfirmed if the device refuses to be read back: its number is then unknown.
+        By function 22 the device keeps the bits of `and_mask`, and sets the others as in `or_mask`. Raises
+        the errors of `write_holding`, and Unconfirmed if the device refuses to be read back: its number is
+        then unknown.
         """
         what = f"holding register {start}"
         self._check_write(what, 1, _MOST_WORDS, confirm)
@@ -143,7 +149,8 @@ class ModbusDevice(Drive):
     ) -> list[bool]:
         """Write a coil or several from `start`, and return the coils that the device then holds.
 
-        If the device refuses to be read back, the written coils are returned. Raises as `write_holding`.
+        If the device refuses to be read back, the written coils are returned. Raises the errors
+        of `write_holding`.
 
         One coil is written by function 5, several by function 15. With `multiple`, function 15 also writes
         one coil.

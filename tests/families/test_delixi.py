@@ -91,7 +91,7 @@ def test_delixi_start_after_a_jog_requires_a_stop() -> None:
     jog = frame(DelixiModbus(1), DelixiModbus.control, DelixiModbusControl.JOG_FORWARD)
     wire = Wire(DelixiModbus(1), MODBUS_STANDING, turns={jog: MODBUS_TURNING} | MODBUS_TURNS)
     wire.drive.jog()
-    with pytest.raises(WriteForbidden, match=r"may still jog.*call stop\(\) first"):
+    with pytest.raises(WriteForbidden, match=r"may still be jogging.*call stop\(\) first"):
         wire.drive.start(Direction.FORWARD)
     wire.drive.stop()
     wire.drive.start(Direction.FORWARD)
@@ -136,7 +136,7 @@ def test_delixi_jog_sends_the_control_word_of_its_direction() -> None:
     wire.drive.jog()
     for direction in Direction:
         with pytest.raises(
-            WriteForbidden, match=r"turns, and may continue to turn during a jog: call stop\(\) first"
+            WriteForbidden, match=r"already turns, and a jog must start from rest: call stop\(\) first"
         ):
             wire.drive.jog(direction)
     wire.say(MODBUS_STANDING)

@@ -132,7 +132,7 @@ def test_invt_che_start_without_a_direction_keeps_a_running_motors_direction() -
     assert [each[:17] for each in wire.sent] == ["01 06 10 00 00 02"]
 
 
-TURNS_ALREADY = r"turns, and may continue to turn during a jog: call stop\(\) first"
+TURNS_ALREADY = r"already turns, and a jog must start from rest: call stop\(\) first"
 UNDOCUMENTED = "has 0005H at 1001H, a state that the manual does not explain"
 
 
@@ -380,7 +380,7 @@ def test_invt_che_start_after_a_jog_requires_a_stop() -> None:
         turns={**TURNS, jog: {"status": CHEStatus.FORWARD}, STOP: {"status": CHEStatus.STANDBY}},
     )
     wire.drive.jog()
-    with pytest.raises(WriteForbidden, match=r"may still jog.*call stop\(\) first"):
+    with pytest.raises(WriteForbidden, match=r"may still be jogging.*call stop\(\) first"):
         wire.drive.start()
     wire.drive.stop()
     wire.drive.start()

@@ -24,7 +24,7 @@ from multidrop.drive.register import (
 from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.verbs import Script, insist, read, verb, write
 
-# seconds allowed for a stop by default, because the number of the deceleration time is not known
+# s; default limit of a stop: the manual does not say which parameter is the deceleration time
 STOP_TIME = 60.0
 
 KEYPAD = "it sets up the line, or decides what commands the motor; set it on the keypad"
@@ -78,7 +78,7 @@ class DelixiBaudrate(IntEnum):
 
 
 class DelixiParameters(Drive):
-    """The parameters of Delixi's inverters. Each subclass passes the table that its protocol uses.
+    """The parameters of Delixi's inverters. A subclass states in which table its protocol reads them.
 
     P04.29, the format, has different codes in each protocol, so subclasses declare it.
 
@@ -278,9 +278,10 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
     _jogged = False  # True if this object has sent a jog since it last saw the motor at rest
 
     def known_counts(self) -> Mapping[Register[Any], tuple[int, int]]:
-        """Return the expected raw counts of P04.30 (address), P04.28 (baud rate) and the bus voltage.
+        """Return a range of raw counts for P04.30 (address), the bus voltage and P04.28 (baud rate).
 
-        Addresses end at 31. The bus voltage is included only from 32 on, so that the ranges do not overlap.
+        The ranges do not overlap: addresses end at 31, and the voltage starts at 32. P04.28 is left out if
+        its code is equal to the address.
         """
         known = {self.address_setting: (self.address, self.address), self.dc_bus_voltage: (32, 0xFFFF)}
         code = DelixiBaudrate.__members__.get(f"B{self.settings.baudrate}", self.address)
@@ -301,7 +302,7 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
     def start(self, direction: Direction | None = None) -> Script[None]:
         """Start at the setpoint in force. Without a direction: forward, and only from rest."""
         if self._jogged and not (yield from self._is_at_rest()):
-            raise self._stop_first(f"{self.name} may still jog, and a start may not end the jog")
+            raise self._stop_first(f"{self.name} may still be jogging, and a start might not end the jog")
         forward = yield from self._goes_forward(direction)
         if (yield from read(self.frequency_source)) != 1:
             raise WriteForbidden(f"{self.name} takes no setpoint from P00.02: set P00.01 to 1 on the keypad")
@@ -317,7 +318,7 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
         """Turn slowly from rest until stopped; without a direction, forward."""
         forward = yield from self._goes_forward(direction)
         if not (yield from self._is_at_rest()):
-            raise self._stop_first(f"{self.name} turns, and may continue to turn during a jog")
+            raise self._stop_first(f"{self.name} already turns, and a jog must start from rest")
         self._jogged = True
         yield from write(
             self.control, DelixiModbusControl.JOG_FORWARD if forward else DelixiModbusControl.JOG_REVERSE

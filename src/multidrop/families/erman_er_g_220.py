@@ -56,7 +56,7 @@ class ErmanFault(IntFlag):
     LOW_DC_VOLTAGE = 1 << 1
     HIGH_DC_VOLTAGE = 1 << 2
     LOW_MOTOR_CURRENT = 1 << 3
-    MOTOR_CURRENT_ABOVE_THRESHOLD = 1 << 4  # 120 or 150 % of the rated current
+    MOTOR_CURRENT_ABOVE_THRESHOLD = 1 << 4  # two thresholds: 120 and 150 % of the rated current
     INVERTER_SHORT_CIRCUIT = 1 << 5
     OVERHEAT = 1 << 6
     PWM_MODULATOR = 1 << 7
@@ -65,7 +65,7 @@ class ErmanFault(IntFlag):
 
 
 class Modes(IntFlag):
-    """Bits of register 0001H. The document does not state what their values mean."""
+    """Bits of register 0001H. The drive's manual does not state what their values mean."""
 
     MODULATION_TYPE = 1 << 0
     CONTROL_TYPE = 1 << 4

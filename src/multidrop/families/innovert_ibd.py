@@ -343,7 +343,7 @@ class InnovertIBD(Drive):
 
     @property
     def _has_state(self) -> bool:
-        """True for a family file that extends this class with run state, output frequency and fault."""
+        """True if a subclass has added run state, output frequency and fault, as family files may do."""
         return {"run_state", "output_frequency", "fault"} <= self.registers.keys()
 
     def _code(self) -> Script[int]:
@@ -370,7 +370,11 @@ class InnovertIBD(Drive):
 
     @verb
     def state(self) -> Script[State]:
-        """Return the state that `run_state` or suitably programmed outputs show; otherwise it is unknown."""
+        """Return the state of the drive.
+
+        It is read from `run_state` or from the outputs, if they are programmed to show the state. Without
+        these, it is UNKNOWN.
+        """
         if self._has_state:
             return (yield from self._shown_state())
         terminals = yield from read(self.terminals)

@@ -300,7 +300,7 @@ class InvtCHE(Drive):
         Without a direction, a turning motor keeps its direction, and a resting motor turns forward.
         """
         if self._jogged and not (yield from self._is_at_rest()):
-            raise self._stop_first(f"{self.name} may still jog, and a start may not end the jog")
+            raise self._stop_first(f"{self.name} may still be jogging, and a start might not end the jog")
         forward = yield from self._goes_forward(direction)
         yield from self._setpoint_in_force()
         self._jogged = False
@@ -312,7 +312,7 @@ class InvtCHE(Drive):
         """Turn slowly from rest until stopped; without a direction, forward."""
         forward = yield from self._goes_forward(direction)
         if not (yield from self._is_at_rest()):
-            raise self._stop_first(f"{self.name} turns, and may continue to turn during a jog")
+            raise self._stop_first(f"{self.name} already turns, and a jog must start from rest")
         self._jogged = True
         yield from write(self.control, CHEControl.JOG_FORWARD if forward else CHEControl.JOG_REVERSE)
         yield from self._started(direction)

@@ -154,8 +154,8 @@ def run_by(register: Register[Any], count: float) -> list[Make]:
 def easily_mistaken_for(drive: Drive) -> list[Make]:
     """Return the makes that must be excluded before a write to a drive that cannot identify itself.
 
-    These makes would run their motors on one of the drive's harmless control words. Makes that cannot be
-    distinguished from the drive's model are included too.
+    A control word that is harmless on this drive, such as its stop, would run the motors of these makes.
+    Makes that cannot be distinguished from the drive's model are included too.
     """
     control = drive.registers.get("control")
     harmless = control.harmless or () if control is not None else ()

@@ -34,7 +34,7 @@ _SHIPPED = Path(__file__).parent / "shipped"
 # names of the family files in this package; each file is read when it is needed
 SHIPPED = tuple(sorted(path.stem for path in _SHIPPED.glob("*.toml")))
 
-# Shipped family files that a scan tries, because more than a status register identifies their drives.
+# Shipped family files that a scan tries. Other registers besides the status identify their drives.
 RECOGNISABLE = ("delixi-e", "invt-chf100a", "invt-goodrive", "powtran-pi130", "yaskawa-a1000")
 
 
@@ -71,7 +71,7 @@ def find_model(text: str, relative_to: Path | None = None) -> type[Drive]:
 
 
 def installed_models() -> list[str]:
-    """Return the families that other installed packages offer, without names that this package uses."""
+    """Return the names of the families in other installed packages, except names of built-in families."""
     names = {point.name for point in _entry_points()}
     return sorted(names - {*MODELS, *SHIPPED})
 

@@ -17,14 +17,14 @@ from multidrop.drive.verbs import Pulse, Script, insist, read, until, verb, wait
 
 STOP_MARGIN = 5.0  # seconds that a stop may take in addition to the deceleration time
 SELECTION_TIME = 1.0  # seconds within which register 1202H must show a newly selected preset speed
-RELEASE_TIME = 2.0  # seconds in which a motor that the panel or the terminals started is seen to turn
+RELEASE_TIME = 2.0  # s; how long a release of control watches for a start by the panel or a terminal
 RESET_TIME = 3.0  # seconds of a restart, in which the drive may not reply
 
 PANEL = "it is effective from the panel only"
 LINE = "it changes the drive's end of the line; set it on the panel"
 COMMAND = "it decides what commands the motor; set it on the panel"
 NO_SCALE = "its scale is not stated"
-RUN_FUNCTIONS = (2, 3)  # functions of a terminal that run the motor, as do F and R by default
+RUN_FUNCTIONS = (2, 3)  # codes of terminal functions that run the motor
 AT_ONCE = "Takes effect at once."
 AFTER_RESET = "Takes effect after a reset or at the next power-on."
 
@@ -32,8 +32,8 @@ AFTER_RESET = "Takes effect after a reset or at the next power-on."
 class YD1000Control(IntFlag):
     """The control word 1000H. Bits 15 and 14 stay set until 0 is written to them or the power fails."""
 
-    COMMAND_VALID = 1 << 15  # this word commands the motor, and not the source that CNOD selects
-    FREQUENCY_VALID = 1 << 14  # register 1001H is the setpoint, and not the source that FNOD selects
+    COMMAND_VALID = 1 << 15  # the motor obeys this word; if 0, parameter CNOD selects what it obeys
+    FREQUENCY_VALID = 1 << 14  # the setpoint is register 1001H; if 0, parameter FNOD selects it
     RESET = 1 << 13
     EMERGENCY_STOP = 1 << 12
     COAST = 1 << 11
@@ -50,7 +50,7 @@ class YD1000Control(IntFlag):
 
 STOP = YD1000Control.COMMAND_VALID | YD1000Control.FREQUENCY_VALID  # only bits 15 and 14, without the run bit
 
-PRESET_SPEEDS = (  # the bits with the values 1, 2 and 4 in the number of the preset speed
+PRESET_SPEEDS = (  # bits for the number of the preset speed, from the lowest binary digit
     YD1000Control.PRESET_SPEED_1,
     YD1000Control.PRESET_SPEED_2,
     YD1000Control.PRESET_SPEED_3,
@@ -99,14 +99,14 @@ def choice(number: int, place: str, most: int | None = None, /, **more: Unpack[D
 
 
 def seconds(number: int, place: str, /, **more: Unpack[Details]) -> Register[float]:
-    """Declare a time. The document does not state its unit, which is assumed to be s."""
+    """Declare a parameter that is a time. The unit s is assumed: the drive's manual states none."""
     more["step"], more["span"] = 0.1, (0.1, 3600)
     more["outside"] = "unit: Toshiba IPE002Z manual, p. 34"
     return setting(number, "s", **_parameter(place, more))
 
 
 def hertz(number: int, place: str, least: float = 0, /, **more: Unpack[Details]) -> Register[float]:
-    """Declare a frequency of up to 320 Hz, the limit of FH. The document does not state the unit."""
+    """Declare a parameter of up to 320 Hz, the limit of FH. The unit is assumed: the manual states none."""
     more["step"], more["span"] = 0.01, (least, 320)
     more["outside"] = "unit: Toshiba IPE002Z manual, p. 35"
     return setting(number, "Hz", **_parameter(place, more))
@@ -459,7 +459,7 @@ class YD1000(Drive):
         yield from self._started(direction)
 
     def _valid(self) -> YD1000Control:
-        """Return the bits that make a control word valid: 15, and 14 if 1001H is the setpoint."""
+        """Return bit 15, which makes a command valid, and bit 14 unless FNOD selects the setpoint."""
         return YD1000Control.COMMAND_VALID if self._by_fnod() else STOP
 
     def _without_fault(self) -> Script[State]:
@@ -469,7 +469,7 @@ class YD1000(Drive):
         return state
 
     def _direction(self) -> Script[Direction]:
-        """Return the direction of a turning motor from 1201H, which is frozen only in a trip."""
+        """Return the direction of a turning motor from 1201H, which the drive updates except in a trip."""
         status = yield from read(self.status)
         return Direction.REVERSE if status & YD1000Status.REVERSE else Direction.FORWARD
 
@@ -487,7 +487,7 @@ class YD1000(Drive):
 
     @verb
     def emergency_stop(self) -> Script[None]:
-        """Stop the motor with the drive's own emergency stop, which is a fault.
+        """Stop the motor with the drive's own emergency stop, which leaves the drive in a fault state.
 
         The command is sent once. If it is not confirmed, the stop along the ramp follows immediately.
         """
@@ -515,7 +515,7 @@ class YD1000(Drive):
 
     @verb
     def reset_fault(self) -> Script[None]:
-        """Restart the drive once, which resets its fault, then send the stop again.
+        """Restart the drive once, which resets its fault. Then send a stop.
 
         The restart loses the setpoint: call set_frequency before the next start.
         """
@@ -532,7 +532,7 @@ class YD1000(Drive):
         """Raise WriteForbidden if a closed terminal would start the motor when control returns to it."""
         closed = yield from read(self.inputs)
         functions = {"F110, which is always on,": self.always_on_function}
-        for number, terminal in enumerate(Inputs, 1):  # F111 has the function of F, F112 that of R, and so on
+        for number, terminal in enumerate(Inputs, 1):  # parameters F111 to F115: functions of the terminals
             if closed & terminal:
                 functions[f"terminal {terminal.name}"] = self.registers[f"input_{number}_function"]
         for what, function in functions.items():
@@ -549,7 +549,7 @@ class YD1000(Drive):
         If the motor is then seen to turn, or the drive does not answer, the stop is written again.
         """
         if not (yield from self._is_at_rest()):
-            raise self._stop_first(f"{self.name} turns")
+            raise self._stop_first(f"the motor of {self.name} turns")
         yield from self._no_terminal_runs("once the line no longer commands it")
         try:
             yield from write(self.control, YD1000Control(0))
@@ -581,7 +581,7 @@ class YD1000(Drive):
 
     @verb
     def state(self) -> Script[State]:
-        """Return whether the motor turns. A frozen 1200H or a new entry in the fault record is a fault."""
+        """Return the state. A new entry in the fault record, or a frequency in 1200H at rest, is a fault."""
         if not (yield from self._is_at_rest()):
             return State(Condition.RUNNING, (yield from self._direction()))
         record = yield from read(self.fault_record_1)
@@ -594,7 +594,7 @@ class YD1000(Drive):
         )
 
     def _is_frozen(self) -> Script[bool]:
-        """Return True if 1200H is frozen while 1100H is 0 (section 8.2), as in a trip or during a start."""
+        """Return True if 1200H is not 0 although 1100H is 0, as in a trip or a start (section 8.2)."""
         if (yield from read(self.held_frequency)) == 0:
             return False
         return (yield from read(self.output_frequency)) == 0

@@ -326,7 +326,8 @@ def _apply(made: ApplyPlan, stops: int, *, commissioning: bool, report: Report |
     result = Applied(made, earlier=journal.earlier())
     call = drive.begin_call("application of parameters", stops)
     if made.writes:
-        if not check_stands(drive):  # the output frequency is 0 Hz, but the motor may have a run command
+        # At 0 Hz the motor may still have a run command, so it is stopped first.
+        if not check_stands(drive):
             call.check("the first parameter")
             drive.stop()
             call = drive.begin_call("application of parameters", stops + 1)

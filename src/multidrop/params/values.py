@@ -120,7 +120,7 @@ class _Reader:
     total: int
     progress: Progress | None
     values: dict[str, int] = field(default_factory=dict)
-    most: int = 0  # length of the longest block that the drive answers; 0 until it has refused a block
+    most: int = 0  # limit of a block's length, learned from refused blocks; 0: no limit is known
     done: int = 0
     silent: int = 0  # number of reads in a row that were not answered
     group: str = ""  # parameter group of the last parameter that was read

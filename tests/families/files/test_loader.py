@@ -188,7 +188,7 @@ TWENTY_MISTAKES = [
     "twenty.toml:3: [family]: unknown key 'manuel'; did you mean manual?",
     "twenty.toml:8: [family]: silence = 'soon' is not a duration from 100 us to 24 h, such as \"50 ms\", "
     '"2 s" or "1 min"',
-    "twenty.toml:6: [family]: addresses = [1, 300]: this must be the first and the last address, from 1 to "
+    "twenty.toml:6: [family]: addresses = [1, 300]: a range is its first and its last address, from 1 to "
     "247 (0 to 255 on Modbus TCP); write addresses = [1, 247]",
     "twenty.toml:4: [family]: baudrates = [9600, 'fast']: 'fast' is not a baud rate; "
     "write baudrates = [9600, 19200]",

@@ -364,7 +364,7 @@ def test_jog_of_a_turning_motor_is_refused(model: str, status: Any) -> None:
     found = wire(model, [status])
     for direction in (None, *Direction):
         with pytest.raises(
-            WriteForbidden, match=r"turns, and may continue to turn during a jog: call stop\(\) first"
+            WriteForbidden, match=r"already turns, and a jog must start from rest: call stop\(\) first"
         ):
             found.drive.jog(direction)
     assert sent(found) == []
@@ -474,7 +474,7 @@ def test_start_of_an_invt_drive_after_a_jog_requires_a_stop() -> None:
     found = wire("invt-goodrive", [GD_STANDBY, GD_RUNS])
     found.drive.jog()
     found.sent.clear()
-    with pytest.raises(WriteForbidden, match=r"may still jog.*stop\(\)"):
+    with pytest.raises(WriteForbidden, match=r"may still be jogging.*stop\(\)"):
         found.drive.start()
     assert found.sent == []
     found.say({"status": found.drive.status.values(GD_STANDBY)})

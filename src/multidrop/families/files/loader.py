@@ -183,7 +183,7 @@ def _base(given: Mapping[str, Any], place: TomlPlace) -> type[Drive]:
 def _check_inherited(
     base: type[Drive], document: Mapping[str, Any], declared: Declared, texts: Iterable[str], place: TomlPlace
 ) -> None:
-    """Report declarations with a name, an address or a section that the extended built-in family has itself.
+    """Report declarations whose name, address or section the extended built-in family already has.
 
     They would replace parts of the family, such as a limit, or a check that prevents a start of the motor.
     """

@@ -33,7 +33,7 @@ class Counting:
     assumed: list[int | str] = field(default_factory=list)
 
     def address(self, given: Any, table: str | None, default: str) -> tuple[int, str]:
-        """Return the address in requests and the table's name for an address in a TOML file.
+        """Convert an address in a TOML file to an address in requests, and the name of its table.
 
         `table` is the table that the register states, `default` the table if it states none. Raises
         ValueError with a valid example for an invalid address.
@@ -52,11 +52,11 @@ class Counting:
         raise ValueError(f'"{text}" is not an address; write 0x2000, 8192, "2000H" or "40001"')
 
     def address_in_cell(self, text: str, table: str | None, default: str) -> tuple[int, str]:
-        """Return the address in requests and the table's name for an address in a CSV cell.
+        """Convert an address in a CSV cell to an address in requests, and the name of its table.
 
-        A CSV cell has no quotes. If the file states `counts_from`, a number in a cell is an address. Raises
-        ValueError if the number may also mean a place in the register's table: 40001 may be an address, or
-        the first holding register.
+        Cells have no quotes, so 40001 may be an address or the first holding register. In a file without
+        `counts_from`, it is the first holding register. In a file with `counts_from`, it is an address; for
+        a holding register it is ambiguous, and raises ValueError.
         """
         text = text.strip()
         if text.isascii() and text.isdecimal():
@@ -114,7 +114,8 @@ def _numbered(text: str, table: str | None) -> tuple[int, str]:
             f"leave out table, or write a number of table {table}"
         )
     if not 1 <= number <= LAST_ADDRESS + 1:
-        raise ValueError(f'"{text}" is outside "{text[0]}{1:0{len(text) - 1}}" to "{text[0]}65536"')
+        first, last = f"{text[0]}{1:0{len(text) - 1}}", f"{text[0]}65536"
+        raise ValueError(f'"{text}" is outside "{first}" to "{last}"')
     return number - 1, named
 
 

@@ -177,7 +177,7 @@ def _counts(value: Any) -> tuple[int, ...]:
     if not isinstance(value, list) or any(type(each) is not int for each in value):
         raise ValueError("the value is not a list of raw counts")
     if len(value) > MOST_LISTED:
-        raise ValueError(f"the value has more than {MOST_LISTED} counts")
+        raise ValueError(f"the value has more than {MOST_LISTED} raw counts")
     return tuple(value)
 
 
@@ -419,7 +419,7 @@ class Declared:
     def _addresses(
         self, given: Mapping[str, Any], good: dict[str, Any], place: TomlPlace, read: ReadAddress
     ) -> tuple[int, str] | None:
-        """Return the register's address and table, None if invalid. Convert the `ram_address` in `good`."""
+        """Return the register's address and table; None if invalid. Make `good["ram_address"]` a number."""
         if "at" not in given or ("table" in given and "table" not in good):
             good.pop("ram_address", None)
             return None

@@ -90,7 +90,7 @@ def family_schema(tables: Sequence[str] = ()) -> dict[str, Any]:
 
 
 def _says(key: str, *values: object) -> dict[str, Any]:
-    """Return the condition that the section [family] has this key, and one of `values` if there are any."""
+    """Return a schema for files whose section [family] has this key, with one of `values` if given."""
     value = {"properties": {key: {"enum": [*values]}}} if values else {}
     return {"properties": {"family": {"type": "object", "required": [key], **value}}, "required": ["family"]}
 
@@ -113,8 +113,8 @@ def _references() -> dict[str, Any]:
     """Return the schema of keys such as `at_most`, whose value is the name of a register or an option.
 
     A JSON Schema cannot look up a name, but it can match names against patterns. Each pattern matches the
-    names of one length, or the names with one character at the start, second, last but one or at the end. If
-    no register or option matches a pattern, the value of a key must not match it either. So every existing
+    names of one length, or the names with one character at the start, second, last but one or at the end. A
+    value is refused if it matches a pattern that no register or option of the file matches. So every existing
     name is accepted, and many misspelt names are refused.
     """
     letters = [f"[{small}{small.upper()}]" for small in ascii_lowercase]
@@ -125,7 +125,7 @@ def _references() -> dict[str, Any]:
     for number, pattern in enumerate(patterns):
         other = {"$ref": f"#/definitions/other-{number}"}
         referring: dict[str, Any] = {"patternProperties": {_REFERENCES: other}}
-        # the tables in a section, such as its registers, and those in a list such as [[identify]]
+        # the registers of a section such as [reading], and the entries of a list such as [[identify]]
         entries = {"additionalProperties": referring, "items": referring}
         parts[f"other-{number}"] = {"not": {"type": "string", "pattern": pattern}}
         parts[f"reference-{number}"] = {
@@ -180,7 +180,7 @@ def _numbered(digits: str) -> dict[str, Any]:
 
 
 def _addresses_of(table: str) -> dict[str, Any]:
-    """Return the part of the schema for the addresses of registers that state this table."""
+    """Return a schema that checks the addresses of registers whose key `table` is this table."""
     others = "".join(digit for name, digit in DIGIT_OF_TABLE.items() if name != table)
     return {
         "if": {"properties": {"table": {"enum": [table, table.upper()]}}, "required": ["table"]},
@@ -215,7 +215,7 @@ def _extending(name: str, base: type[Drive]) -> dict[str, Any]:
 def _without_written(first: int, found: list[int]) -> dict[str, Any]:
     """Return the schema that forbids registers at the addresses `found` if `counts_from` is `first`.
 
-    At these addresses, the family that the file extends has registers that it writes.
+    `found` are the addresses of the writable registers in the built-in family that the file extends.
     """
     numbered = "|".join(f"{at + 1:04}" if at < 9_999 else f"{at + 1}" for at in found)
     in_table = {"type": "string", "pattern": rf"^\s*40?({numbered})\s*$"}
@@ -227,7 +227,7 @@ def _without_written(first: int, found: list[int]) -> dict[str, Any]:
 
 
 def _with_profile(name: str, roles: Mapping[str, Role]) -> dict[str, Any]:
-    """Return the part of the schema for files with this profile, whose registers may have these roles."""
+    """Return a schema for files with the key `profile = name`. The profile uses the registers `roles`."""
     reserved = {*dir(Profile), *Profile.__annotations__} - {*dir(Drive)}
     return {
         "if": _says("profile", name),
@@ -250,9 +250,9 @@ def _with_profile(name: str, roles: Mapping[str, Role]) -> dict[str, Any]:
 
 
 def _of_roles(roles: Mapping[str, Role]) -> dict[str, Any]:
-    """Return the schema of a section such as [reading] in a family file with a profile.
+    """Return the schema of one section, such as [reading], in a family file with the key `profile`.
 
-    `roles` are the registers that the profile uses, in any section.
+    `roles` are the names of the registers that the profile uses.
     """
     return {
         "properties": {role: _of_role(role, roles[role]) for role in roles},
@@ -265,10 +265,7 @@ def _has(section: str, name: str) -> dict[str, Any]:
 
 
 def _of_role(name: str, role: Role) -> dict[str, Any]:
-    """Return the schema of a register with this role.
-
-    The profile declares the register's other attributes.
-    """
+    """Return the schema of a register that the profile uses. It forbids the keys that the profile sets."""
     facts: dict[str, Any] = {
         "harmless": {"maxItems": 0},
         "never_together": {"maxItems": 0},
@@ -404,7 +401,7 @@ def _register() -> dict[str, Any]:
 
 
 def _of_access(access: Access) -> dict[str, Any]:
-    """Return the schema of a register in the section for this access, such as [reading]."""
+    """Return the schema of a register in one section; `access` stands for it, as READING for [reading]."""
     if access is Access.READING:
         never_written = {key: {"maxItems": 0} for key in _NEVER_WRITTEN}
         only: dict[str, Any] = {"properties": {**never_written, "moves": {"const": False}}}

@@ -155,7 +155,7 @@ def _unit_addresses(value: list[Any]) -> range:
     least, most = UNIT_IDS[0], UNIT_IDS[-1]
     if len(value) != 2 or not all(map(is_whole, value)) or not least <= value[0] <= value[1] <= most:
         raise ValueError(
-            f"this must be the first and the last address, from 1 to 247 ({least} to {most} on Modbus TCP)"
+            f"a range is its first and its last address, from 1 to 247 ({least} to {most} on Modbus TCP)"
         )
     return range(value[0], value[1] + 1)
 

@@ -236,7 +236,8 @@ class Profidrive(Profile):
     def _prepare(self, status: int) -> Script[None]:
         yield from insist(self.control, self._word(OFF))
         if not (yield from until(self._is_ready, limit=READY_TIME)):
-            raise WriteForbidden(f"{self.name} {self._hindrance((yield from self._status()))}; {self.remote}")
+            why = self._hindrance((yield from self._status()))
+            raise WriteForbidden(f"{self.name} is not started: {why}; {self.remote}")
         yield from wait(BETWEEN)
         yield from write(self.control, self._word(ON))
         if not (yield from until(self._is_on, limit=READY_TIME)):
@@ -255,12 +256,12 @@ class Profidrive(Profile):
     def _hindrance(self, status: int) -> str:
         """Return the most serious reason why the drive cannot be switched on, as text."""
         if not status & ProfidriveStatus.NO_OFF2:
-            return "is not started: OFF2, which coasts, is active from elsewhere"
+            return "OFF2, which coasts, is active from elsewhere"
         if not status & ProfidriveStatus.NO_OFF3:
-            return "is not started: OFF3, the quick stop, is active from elsewhere"
+            return "OFF3, the quick stop, is active from elsewhere"
         if status & ProfidriveStatus.SWITCH_ON_INHIBITED:
-            return "is not started: switching on is inhibited"
-        return "is not started: it is not ready to be switched on"
+            return "switching on is inhibited"
+        return "it is not ready to be switched on"
 
 
 # ---- Danfoss FC ----
@@ -397,10 +398,10 @@ class Optidrive(Profile):
 
     Its maker is Invertek; it is also sold under other names.
 
-    - An Optidrive Plus 3GV has bit 1 for the reset and bit 2 for the second ramp. Bit 1 is never sent.
-    - The first guide (1.00) prints the two bytes of register 6 in the opposite order to later guides. A start
-      needs bit 6, ready, which a drive of the first guide never shows. A drive counts as stopped only if its
-      output frequency is 0.
+    - On an Optidrive Plus 3GV, bit 1 is the reset, and bit 2 selects the second ramp. Bit 1 is never sent.
+    - The first edition of the guide (1.00) prints the two bytes of register 6, the status, in the opposite
+      order to later editions. A start needs bit 6 (ready). Drives with the opposite order never set it, so
+      they are never started. A drive counts as stopped only if its output frequency is 0.
     - No guide says whether the reset bit acts on its edge. So a stop is sent before the reset, and the bit
       is cleared after it.
     - The direction is the sign of the setpoint. No negative setpoint is written.

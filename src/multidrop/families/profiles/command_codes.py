@@ -65,7 +65,7 @@ class DeltaStatus(IntFlag):
     BIT_15 = 1 << 15
 
 
-# Delta's status, bits 15 to 13: reserved, or HOA and LOC/REM mode on a C2000 Plus (its manual, p. A-10)
+# Valid numbers in bits 15 to 13 of Delta's status. On a C2000 Plus they are the control mode (p. A-10).
 MODES = range(5)
 
 
@@ -174,11 +174,13 @@ _DIRECTIONS: Mapping[int, Direction] = {
 class Invt(Profile):
     """INVT's control words: a number for each of forward, reverse, jog, stop, coast and reset.
 
-    - Other makes have copied the words with 5 and 6 exchanged (both stop), and some with 5 for reverse. Such
-      a family names its own numbers in `control`: `{ forward = 1, stop = 6, coast = 5, reset_fault = 7 }`. A
-      word that it leaves out is never sent. Compare each of the numbers with the manual's list.
-    - A stop may not end a jog. If the stop is refused, the motor still turns after it, or the state is
-      unknown, STOP_JOG follows immediately. A start may not end a jog either: after a jog a stop is required.
+    - Other makes have copied these numbers with changes. Some exchange 5 (stop) and 6 (coast), and some have
+      5 for reverse. Such a family states its own numbers in `control`, such as
+      `{ forward = 1, stop = 6, coast = 5, reset_fault = 7 }`. A control word that it leaves out is never
+      sent. Compare each of the numbers with the manual's list.
+    - A stop might not end a jog. If the stop is refused, the motor still turns after it, or the state is
+      unknown, STOP_JOG follows immediately. A start might not end a jog either: after a jog a stop is
+      required.
     """
 
     stop_word: ClassVar[int] = InvtControl.STOP
@@ -221,7 +223,8 @@ class Invt(Profile):
     def _word(self, count: int, role: str = "control") -> Any:
         word = InvtControl(count)
         if not self._has(word):
-            raise self._unsupported(f"{word.name.lower().replace('_', ' ')} command")
+            command = word.name.lower().replace("_", " ") + " command"
+            raise self._unsupported(command)
         return cast(Any, self.control.values)[word.name]
 
     def _start_word(self, direction: Direction | None, status: int) -> int:
@@ -230,7 +233,7 @@ class Invt(Profile):
     def _check_start(self, status: int) -> Script[None]:
         yield from super()._check_start(status)
         if self._jogged and not (yield from self._is_at_rest()):
-            raise self._stop_first(f"{self.name} may still jog, and a start may not end the jog")
+            raise self._stop_first(f"{self.name} may still be jogging, and a start might not end the jog")
         self._jogged = False
 
     @verb

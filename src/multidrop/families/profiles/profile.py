@@ -42,7 +42,8 @@ class Role:
     moves: bool | None = None
     units: tuple[str, ...] = ()  # allowed units; empty: any
     extra: tuple[str, ...] = ()  # names of bits that a family may add, because makes differ in these bits
-    renumbered: tuple[str, ...] = ()  # words that a family must list if it lists its own raw counts
+    # control words, such as "stop", that a family must list if it has raw counts of its own
+    renumbered: tuple[str, ...] = ()
     needed: bool = True
 
     @property
@@ -144,7 +145,7 @@ def _extra_errors(name: str, role: Role, extra: type[Any]) -> Iterator[str]:
 
 
 def _renumbering_errors(name: str, role: Role, values: type[Any]) -> Iterator[str]:
-    """Yield the errors in the numbers that a family gives to the profile's control words."""
+    """Yield the errors in a family's own raw counts of control words such as `stop`."""
     assert role.values is not None
     known = [str(member.name).lower() for member in role.values]
     names = [name.lower() for name in values.__members__]
@@ -236,7 +237,7 @@ class Profile(Drive):
     output_frequency: ClassVar[Register[float]]
 
     def __init_subclass__(cls) -> None:
-        """Complete the registers with the profile's attributes. Raises DeclarationError with all mistakes."""
+        """Complete the registers that are listed in `roles`. Raises DeclarationError with all mistakes."""
         own = {name: register for name, register in vars(cls).items() if isinstance(register, Register)}
         if own and (wrong := cls.role_mistakes(own)):
             raise DeclarationError(cls.__name__, wrong)
@@ -295,7 +296,7 @@ class Profile(Drive):
         return None
 
     def _reverses(self, direction: Direction | None, status: int) -> bool:
-        """Return True for a start or jog in reverse; None means the direction of a turning motor."""
+        """Return True for a start or jog in reverse. With None, a turning motor keeps its direction."""
         if direction is None:
             return self._turns(status) and self._direction(status) is Direction.REVERSE
         return direction is Direction.REVERSE
@@ -304,7 +305,7 @@ class Profile(Drive):
         raise NotImplementedError
 
     def _prepare(self, status: int) -> Script[None]:
-        """Bring the drive into the state in which it accepts the start word, without moving the motor."""
+        """Override this if other writes must precede the start word. They must not move the motor."""
         yield from ()
 
     def _condition(self, status: int) -> Condition:
@@ -353,7 +354,10 @@ class Profile(Drive):
 
     @verb
     def identify(self) -> Script[None]:
-        """Check that the status fits this profile, and that `station`, `signature` and [[identify]] match."""
+        """Check that the status, and the registers that identify the family, have the expected values.
+
+        `station` is the drive's address; `signature` and the proofs of [[identify]] are those of the family.
+        """
         wrong: list[str] = []
         status = yield from self._status()
         if impossible := self._impossible(status):
@@ -402,14 +406,14 @@ class Profile(Drive):
                 f"{self.name} cannot be started: its status is {status:04X}H, and {impossible}"
             )
         if why := self._not_ready(status):
-            raise WriteForbidden(f"{self.name} {why}; {self.remote}")
+            raise WriteForbidden(f"{self.name} is not started: it {why}; {self.remote}")
 
     def _jog_word(self, direction: Direction | None, forward: int, reverse: int) -> Script[Any]:
         """Return the control word of a jog. Raises WriteForbidden as `start` does, and if the motor turns."""
         status = yield from self._status()
         yield from self._check_start(status)
         if self._turns(status):  # the manuals do not define a jog while the motor turns
-            raise self._stop_first(f"{self.name} turns, and may continue to turn during a jog")
+            raise self._stop_first(f"{self.name} already turns, and a jog must start from rest")
         return self._word(reverse if self._reverses(direction, status) else forward)
 
     def _word(self, count: int, role: str = "control") -> Any:
@@ -456,7 +460,7 @@ class Profile(Drive):
                 raise WriteForbidden(f"{self.name} runs: it has no fault to reset")
             return
         if why := self._cannot_reset(status):
-            raise WriteForbidden(f"{self.name} {why}")
+            raise WriteForbidden(f"{self.name} is not reset: it {why}")
         yield from insist(self.control, self._word(self.stop_word))  # ends a run that was commanded earlier
         yield from self._pulse()
         if not (yield from until(self._is_reset, limit=RESET_TIME)):
