@@ -181,7 +181,7 @@ def test_reload_of_the_plant_continues_totals_without_an_outage() -> None:
     assert second.outages == []
 
 
-def test_an_integral_skips_the_time_between_two_drives_of_one_name() -> None:
+def test_an_integral_skips_the_time_while_a_drive_is_replaced() -> None:
     ratio = Channel("ratio", "power / 2", "kW")
     energy, change = (
         Channel("energy", "integral(ratio)", "kW*s"),

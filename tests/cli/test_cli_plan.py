@@ -134,7 +134,7 @@ def test_a_drive_without_a_rate_gets_time_on_an_overloaded_line(run: Run, crowde
 
 
 @pytest.mark.parametrize("model", ["yd1000", "delixi-modbus"])
-def test_the_plan_command_warns_of_polling_each_reading_by_its_own_request(
+def test_the_plan_command_warns_if_polling_all_readings_takes_too_long(
     run: Run, tmp_path: Path, model: str
 ) -> None:
     path = tmp_path / "plant.toml"

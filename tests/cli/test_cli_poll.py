@@ -158,7 +158,7 @@ LATE_OR_SILENT = {str(each) for each in (Status.NO_REPLY, Status.LATE_ANSWER_DUE
 
 
 @pytest.mark.slow
-def test_poll_records_as_many_rows_as_its_summary_counts(run: Run, plant: Path, tmp_path: Path) -> None:
+def test_a_recording_has_as_many_rows_as_the_summary_counts(run: Run, plant: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.arrows"
     status, told, err = run("poll", plant, "--seconds", 0.6, "--out", out, "--json")
     assert (status, err) == (0, "")
@@ -221,7 +221,7 @@ def test_poll_ended_by_a_signal_keeps_its_recording(plant: Path, tmp_path: Path,
 
 
 @pytest.mark.slow
-def test_poll_prints_its_summary_and_the_comparison_as_text(run: Run, plant: Path) -> None:
+def test_the_poll_summary_compares_predicted_and_measured_rates_as_text(run: Run, plant: Path) -> None:
     plant.write_text(plant.read_text().replace("address = 9\n", "address = 9\nbaudrate = 19200\n"))
     lines = run("poll", plant, "--seconds", 0.6)[1].splitlines()
     assert lines[0].startswith("hall-1: ")

@@ -246,7 +246,7 @@ def test_a_gateways_exception_is_not_the_drives_answer(run: Run, responder: Any,
 
 
 @pytest.mark.slow
-def test_a_gateways_exception_proves_its_framing(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_exception_reply_shows_the_framing_of_a_gateway(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """Bytes without a frame do not prove that the far end speaks the other framing."""
     monkeypatch.setattr(doctor, "MOST_S", 1.0)
     monkeypatch.setattr(doctor.ask_once, "__defaults__", (RS485.OFF, 0.5))

@@ -165,7 +165,7 @@ def test_params_compares_two_files_and_two_drives(run: Run, drive: tuple[object,
         (("list", "invt-che"), "no reliable rule"),
     ],
 )
-def test_mistaken_params_arguments_are_reported_in_one_sentence(
+def test_wrong_arguments_of_the_params_command_are_reported_in_one_sentence(
     run: Run, drive: tuple[object, ...], words: tuple[str, ...], sentence: str
 ) -> None:
     Path("plant.toml").write_text("[[line]]\nname = 'hall'\n")
@@ -230,7 +230,9 @@ def test_contradicting_options_of_run_are_refused(run: Run, tmp_path: Path) -> N
     assert "which commands fan at up to 30 Hz, and then stops all drives of the plant?" in errors
 
 
-def test_the_question_before_a_run_names_missing_setpoints_and_faults(run: Run, tmp_path: Path) -> None:
+def test_the_question_before_a_run_mentions_missing_setpoints_and_fault_registers(
+    run: Run, tmp_path: Path
+) -> None:
     text = '[[phase]]\nname = "a"\n[[phase.step]]\nstart = ["fan"]\ndwell = "9 s"'
     status, _, errors = run("run", write_test(tmp_path, text, fan=HIDDEN))
     assert status == 1

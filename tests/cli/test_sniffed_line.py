@@ -46,7 +46,7 @@ def drives() -> list[Drive]:
     ]
 
 
-Said = tuple[int, int, list[int] | int]  # address, function, and values or minus the exception code
+Said = tuple[int, int, list[int] | int]  # address; function; values, or the negative exception code
 NUMBERS = itertools.count(1)  # each number is written only once, so that each exchange is unique
 
 

@@ -275,7 +275,7 @@ def test_a_wrapped_table_is_redrawn_after_the_terminal_narrowed(tmp_path: Path, 
     assert again == ["\x1b[2F\x1b[J", "\x1b[3F\x1b[J"]
 
 
-def test_the_live_table_shows_warnings_above_it_and_counts_no_channel_rows(
+def test_the_live_table_stays_below_warnings_and_counts_only_registers(
     tmp_path: Path, size: list[int], capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "plant.toml"
@@ -295,7 +295,7 @@ def test_the_live_table_shows_warnings_above_it_and_counts_no_channel_rows(
     assert capsys.readouterr().err == f"{drawing}\x1b[2F\x1b[J{warnings[0]}{drawing}{warnings[1]}"
 
 
-def test_a_name_that_cannot_be_encoded_moves_no_column(tmp_path: Path, size: list[int]) -> None:
+def test_the_columns_stay_aligned_if_a_name_cannot_be_encoded(tmp_path: Path, size: list[int]) -> None:
     (text,) = drawings(tmp_path, "ascii", size, 80)
     assert "\\u" not in text
     assert text.endswith("\n??-1        1       0  output_frequency 42.50 Hz\n")

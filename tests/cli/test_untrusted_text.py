@@ -83,7 +83,7 @@ def test_a_url_is_printed_without_user_and_password() -> None:
         (["read", "{}", "invt-che", "1", "status"], {}),
     ],
 )
-def test_no_message_of_a_command_contains_a_urls_password(
+def test_the_messages_of_commands_contain_no_password_of_a_url(
     words: list[str],
     variables: dict[str, str],
     tmp_path: Path,
@@ -122,7 +122,9 @@ def test_a_plant_files_mistakes_are_reported_without_a_urls_password(tmp_path: P
 
 
 @pytest.mark.parametrize("form", ["text", "json"])
-def test_a_gateways_log_contains_no_urls_password(capfd: pytest.CaptureFixture[str], form: str) -> None:
+def test_the_log_of_a_gateway_contains_no_password_of_a_url(
+    capfd: pytest.CaptureFixture[str], form: str
+) -> None:
     with logging_to_stderr(form, {"multidrop": logging.INFO}):
         failure = OSError(f"nats://bob:{SECRET}@host is lost")
         logging.getLogger("multidrop.gateway").error("at %s", f"nats://{SECRET}@host", exc_info=failure)

@@ -38,7 +38,7 @@ PACKAGES: dict[str, tuple[types.ModuleType, ...]] = {  # reader: modules whose c
     "parquet": (multidrop.recording,),
     "pcap": (multidrop.capture,),
 }
-MODULES = (  # modules that several readers use: always measured
+MODULES = (  # modules whose coverage is measured for every reader
     multidrop.plant.model,
     multidrop.toml_check,
     multidrop.families.registry,

@@ -86,13 +86,14 @@ NOT_RUN = {
     "multidrop sniff /dev/ttyUSB1": "needs a line with another master: tests/cli/test_cli_sniff.py",
 }
 PROGRAMS = ("openssl", "chmod", "echo")  # other programs that the code blocks of a page may run
-COMPUTED = "multidrop plan"  # its figures are computed, so they must be equal; other commands measure theirs
+# The command with computed figures, which must equal those on the page. Other commands print measured ones.
+COMPUTED = "multidrop plan"
 STATUS = {"multidrop plan full.toml": 1}  # exit status of commands that must not exit with 0
-SHORTER = (  # replacements that make long runs shorter
+REPLACED = (  # replacements in code blocks, for short runs on busy machines
     (r"--seconds \d+", "--seconds 1"),
     (r"seconds=\d+", "seconds=0.5"),
     (r'dwell = "\d+ s"', 'dwell = "1 s"'),
-    # a test run tolerates a longer silence of a drive, because busy machines cause it
+    # a longer limit of the time without values, because replies may be late on busy machines
     (r'silence = "\d+ s"', 'silence = "30 s"'),
     (r"--addresses 1-4", "--addresses 1-3 --quick"),
     (r"(multidrop scan /dev/ttyUSB0)", r"\1 --addresses 1-2 --baudrates 9600 --formats 8N1 --quick"),
@@ -150,12 +151,12 @@ class Session:
     def __init__(self, stack: ExitStack) -> None:
         self.space: dict[str, Any] = {"__name__": "page"}
         self._stack = stack
-        self._wires: dict[str, str] = {}  # port in the page's text: link to the simulated line
+        self._wires: dict[str, str] = {}  # links to the simulated lines, by the port on the page
 
     def run(self, block: Block) -> None:
         """Run a block. Its exceptions pass through."""
         text = block.text
-        for pattern, enough in SHORTER:
+        for pattern, enough in REPLACED:
             text = re.sub(pattern, enough, text)
         saved = re.match(r"# ([\w-]+\.(?:toml|py))\n", text)
         if block.language == "toml":
@@ -273,7 +274,7 @@ def session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Session
 
 @pytest.mark.usefixtures("_turns_awaited")  # writes have no time limit, because a busy machine delays them
 @pytest.mark.parametrize("page", usually(*RUN), ids=named)
-def test_page_runs_as_printed(page: Path, session: Session) -> None:
+def test_the_code_blocks_of_a_page_run_as_printed(page: Path, session: Session) -> None:
     text = page.read_text("utf-8")
     for needs, module in NEEDED.items():
         if needs in text and find_spec(module) is None:
@@ -447,7 +448,7 @@ def test_speed_table_equals_readme() -> None:
     assert speed.strip() in (ROOT / "README.md").read_text("utf-8")
 
 
-def test_timing_diagrams_match_their_tables(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_timing_diagrams_are_up_to_date(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(DOCS / "pictures"))
     diagrams = importlib.import_module("diagrams")
     for name in diagrams.DIAGRAMS:

@@ -115,7 +115,7 @@ def is_long_by_nature(path: Path, line: str) -> bool:
     return path.suffix in (".c", ".h") and "csrc" not in path.parts and not re.search(r"/\*|^ \*", line)
 
 
-def test_no_loop_variable_is_called_it() -> None:
+def test_no_loop_variable_has_the_name_it() -> None:
     found = [
         place(path, line) for path in files("src") for line, name in loop_variables(path) if name == "it"
     ]

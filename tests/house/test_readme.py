@@ -335,7 +335,7 @@ def rows() -> dict[str, list[str]]:
     return {promise: others for promise, *others in cells[2:]}
 
 
-def test_every_promise_of_the_readme_has_a_row_with_its_tests() -> None:
+def test_the_promises_table_lists_tests_for_every_promise() -> None:
     assert tuple(rows()) == PROMISES
     for _, decided, measured in rows().values():
         assert re.search(r"`tests/\w+/test_\w+\.py`", decided)
@@ -346,13 +346,13 @@ def named(pattern: str) -> list[str]:
     return sorted({name for code in CODE for name in re.findall(rf"(?<![\w./]){pattern}", code)})
 
 
-def test_files_named_on_the_promises_page_exist() -> None:
+def test_every_file_named_in_the_test_readme_exists() -> None:
     paths = named(FILE)
     assert len(paths) > 90
     assert [path for path in paths if not (ROOT / path).exists()] == []
 
 
-def test_tests_named_on_the_promises_page_exist() -> None:
+def test_every_test_named_in_the_test_readme_exists() -> None:
     """Check that each named test is in the file that the page names before it."""
     missing, number, file = [], 0, ""
     for path, name in re.findall(r"(tests/[\w/]+/test_\w+\.py)|`(test_\w+)`", PAGE):
@@ -377,7 +377,7 @@ def script(command: str) -> Path | None:
     return files[0] if files and files[0].suffix == ".py" else None
 
 
-def test_commands_and_options_named_on_the_promises_page_exist() -> None:
+def test_every_command_and_option_named_in_the_test_readme_exists() -> None:
     common = (ROOT / "tests" / "conftest.py").read_text("utf-8")
     commands = {command: file for command in CODE if (file := script(command))}
     assert len(commands) > 90

@@ -174,7 +174,7 @@ OF_C = {
     "if (*at <= most)",
     "if (*at >= most)",
     "if (!(*at < most))",
-    ";",  # a mutant without a statement; there is one for each of three statements
+    ";",  # a mutant in which one statement was deleted
     "return 1;",
     "return 0;",
     "return -0;",
@@ -242,7 +242,7 @@ def test_the_mutants_listed_in_explained_toml_exist() -> None:
 
 
 @pytest.mark.long
-def test_mutation_trials_compile_existing_files() -> None:
+def test_the_c_files_of_the_mutation_tests_exist() -> None:
     assert all((ROOT / "csrc" / name).exists() for name in core_files(ROOT))
     assert {"frame.c", "system/waiter.c", "system/wakeup.c"} <= {*core_files(ROOT)}
 

@@ -1,4 +1,4 @@
-"""Check the import rules between rooms (packages of src/multidrop), and the pages that name their files."""
+"""Check the import rules between the packages of src/multidrop, and the pages that name their files."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ OUTSIDE = {
     *("os", "time", "select", "selectors", "socket", "serial", "termios", "fcntl", "pty", "tty"),
     *("signal", "subprocess"),
 }
-# packages by floor, the lowest floor first: a package may import only from lower floors
-FLOORS = [
+# packages by layer, the lowest layer first: a package may import only from lower layers
+LAYERS = [
     {"errors", "exposition", "iso_time", "printable", "supervisor", "toml_document", "whole_file"},
     {"toml_check"},
     {"core"},
@@ -105,17 +105,17 @@ MOST_LINES_OF_A_FILE = 600
 IMPORT_OF_A_TEST = re.compile(r"\b(import|from)\b.*\btest_")
 
 
-def room(path: Path) -> str:
+def package(path: Path) -> str:
     return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
 
 
-def rooms(modules: set[str]) -> set[str]:
+def packages(modules: set[str]) -> set[str]:
     return {name.split(".")[1] for name in modules if name.startswith("multidrop.")}
 
 
-def floor(name: str) -> int:
-    """Return the floor (layer) of a package. Public names are above all packages."""
-    return next((number for number, names in enumerate(FLOORS) if name in names), len(FLOORS))
+def layer(name: str) -> int:
+    """Return the layer of a package. Public names are above all packages."""
+    return next((number for number, names in enumerate(LAYERS) if name in names), len(LAYERS))
 
 
 def offenders(found: dict[str, set[str]]) -> dict[str, set[str]]:
@@ -123,10 +123,12 @@ def offenders(found: dict[str, set[str]]) -> dict[str, set[str]]:
 
 
 def upwards(path: Path, modules: set[str]) -> set[str]:
-    others = rooms(modules) - {"_core", room(path)}
-    if room(path) in CLIENTS:  # these packages are checked by test_gateway_and_fleet_import_only_public_names
+    others = packages(modules) - {"_core", package(path)}
+    if (
+        package(path) in CLIENTS
+    ):  # these packages are checked by test_gateway_and_fleet_import_only_public_names
         others -= set(multidrop.__all__)
-    return {name for name in others if floor(name) >= floor(room(path))}
+    return {name for name in others if layer(name) >= layer(package(path))}
 
 
 @pytest.mark.long
@@ -135,13 +137,13 @@ def test_dir_lists_public_names_before_their_modules_are_imported() -> None:
 
 
 @pytest.mark.long
-def test_every_package_has_a_layer() -> None:
-    assert {room(path) for path in FILES} <= set().union(*FLOORS)
+def test_every_package_is_in_the_list_of_layers() -> None:
+    assert {package(path) for path in FILES} <= set().union(*LAYERS)
 
 
 @pytest.mark.long
 def test_only_core_imports_the_compiled_module() -> None:
-    found = {str(path.relative_to(PACKAGE)) for path in FILES if "_core" in rooms(run_time_imports(path))}
+    found = {str(path.relative_to(PACKAGE)) for path in FILES if "_core" in packages(run_time_imports(path))}
     assert {name for name in found if not name.startswith("core/")} == set()
 
 
@@ -154,9 +156,9 @@ def test_only_listed_files_import_operating_system_modules() -> None:
 
 
 @pytest.mark.long
-def test_families_import_only_the_package_drive() -> None:
+def test_drive_families_import_only_from_the_drive_package() -> None:
     families = sorted({*(PACKAGE / "families").glob("*.py")} - {PACKAGE / "families" / "registry.py"})
-    found = {path.name: rooms(run_time_imports(path)) - {"drive", "families"} for path in families}
+    found = {path.name: packages(run_time_imports(path)) - {"drive", "families"} for path in families}
     assert offenders(found) == {}
 
 
@@ -198,7 +200,7 @@ def test_gateway_and_fleet_import_only_public_names(client: str) -> None:
             name for name in _imported(path) if name.startswith("multidrop.") and not _is_public(name, client)
         }
         for path in FILES
-        if room(path) == client
+        if package(path) == client
     }
     assert found
     assert offenders(found) == {}
@@ -212,7 +214,7 @@ def _is_public(name: str, client: str) -> bool:
 @pytest.mark.long
 @pytest.mark.parametrize("client", CLIENTS)
 def test_only_listed_commands_import_gateway_or_fleet(client: str) -> None:
-    found = {str(path.relative_to(PACKAGE)) for path in FILES if client in rooms(_imported(path))}
+    found = {str(path.relative_to(PACKAGE)) for path in FILES if client in packages(_imported(path))}
     assert {name for name in found if not name.startswith(f"{client}/")} <= CLIENTS[client]
 
 
@@ -240,10 +242,10 @@ def _imported(path: Path) -> set[str]:
 
 @pytest.mark.long
 def test_packages_without_io_import_no_clocks_or_ports() -> None:
-    """Check that the rooms `drive`, `planning` and `channels` import no module for clocks or ports."""
+    """Check that the packages `drive`, `planning` and `channels` import no module for clocks or ports."""
     ports = {"multidrop.core.port", "multidrop.core.capture"}
     outside = OUTSIDE | ports | {"datetime", "random", "threading", "pathlib", "asyncio"}
-    pure = [path for path in FILES if room(path) in ("drive", "planning", "channels")]
+    pure = [path for path in FILES if package(path) in ("drive", "planning", "channels")]
     assert offenders({str(path.relative_to(PACKAGE)): _imported(path) & outside for path in pure}) == {}
 
 
@@ -311,7 +313,7 @@ def test_python_calls_each_function_of_the_core_s_public_headers() -> None:
 
 
 @pytest.mark.long
-def test_no_function_of_the_core_is_long() -> None:
+def test_no_c_function_is_longer_than_the_limit() -> None:
     bodies = {
         f"{name}: {head}": body.count("\n") + 1
         for name, text in core().items()
@@ -362,8 +364,8 @@ def test_every_file_has_a_row_on_the_architecture_page() -> None:
     named = {name.rstrip("/") for row in rows for name in re.findall(r"`([^`]+)`", row)}
     csrc = ROOT / "csrc"
     places = [*PACKAGE.iterdir(), *csrc.glob("*.c"), *csrc.glob("system/*.c"), csrc / "windows"]
-    rooms = {path.name for path in places if path.name[0] != "_" and path.suffix in ("", ".py", ".c")}
-    assert {room for room in rooms if not any(fnmatch(room, name) for name in named)} == set()
+    packages = {path.name for path in places if path.name[0] != "_" and path.suffix in ("", ".py", ".c")}
+    assert {package for package in packages if not any(fnmatch(package, name) for name in named)} == set()
 
 
 @table("walk", WALKS, ids=[walk.stem for walk in WALKS])

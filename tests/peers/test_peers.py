@@ -182,7 +182,7 @@ def test_commands_read_and_write_registers(server: Server, capsys: pytest.Captur
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["libmodbus tcp", "pymodbus tcp"])
-def test_multidrop_poll_reads_all_values_of_another_server(name: str, tmp_path: Path) -> None:
+def test_a_poller_reads_all_values_from_other_libraries_servers(name: str, tmp_path: Path) -> None:
     path = tmp_path / "plant.toml"
     with running(name, tmp_path) as server:
         path.write_text(
@@ -302,7 +302,7 @@ def test_plan_of_39_floats_at_9600_baud_prints_the_documented_table(
 @pytest.mark.parametrize(
     ("stated", "most"), [(True, "at most 80"), (False, "at most 125, the standard's limit")]
 )
-def test_the_command_models_prints_the_read_limit(
+def test_the_read_limit_of_a_family_file_is_printed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], stated: bool, most: str
 ) -> None:
     assert main(["models", str(family_file(tmp_path, stated=stated))]) == 0

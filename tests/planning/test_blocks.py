@@ -82,7 +82,7 @@ def test_read_plan_does_not_depend_on_order_or_repetition_of_registers() -> None
     assert spans(Example(1), "c", "a", "b", "a") == [(1, 4)]
 
 
-def test_read_plan_for_a_register_that_cannot_be_read_raises() -> None:
+def test_a_write_only_register_in_a_read_plan_is_refused() -> None:
     with pytest.raises(ValueError, match=r"run of .* cannot be read: it is a command"):
         blocks(Example(1), [Example.run])
 
@@ -219,7 +219,7 @@ class Scattered(Drive):
     st.floats(0, 0.2),
     st.floats(0, 1),
 )
-def test_a_plan_is_the_quickest_only_within_its_range_of_response_delays(
+def test_a_read_plan_is_quickest_only_within_its_range_of_response_delays(
     wanted: set[Register[float]], baudrate: int, framing: Framing, delay: float, part: float
 ) -> None:
     drive = Scattered(1, baudrate=baudrate, framing=framing)
@@ -241,7 +241,7 @@ def test_a_plan_is_the_quickest_only_within_its_range_of_response_delays(
             assert excess(outside) > 1e-6
 
 
-def test_a_plan_for_several_rates_has_their_common_range_of_delays() -> None:
+def test_a_delay_suits_a_read_plan_if_it_suits_each_polling_rate() -> None:
     drive = Scattered(1, baudrate=9600)
     rates = {0.1: [Scattered.r0, Scattered.r2], None: [Scattered.r3, Scattered.r5]}
     apart = [
@@ -430,7 +430,7 @@ def test_requests_that_read_the_built_in_families_are_unchanged(model: str) -> N
     assert sorted(found) == REQUESTS[model]
 
 
-def test_meter_of_39_floats_needs_eight_requests_or_four_with_readable_gaps() -> None:
+def test_fewer_requests_read_a_meter_if_they_may_include_undeclared_addresses() -> None:
     assert len(ADDRESSES) == 39
     lines = []
     for meter in (Meter, StatedMeter):
@@ -441,7 +441,7 @@ def test_meter_of_39_floats_needs_eight_requests_or_four_with_readable_gaps() ->
     assert lines == [(8, 0.341), (4, 0.268)]
 
 
-def test_requests_to_a_meter_include_only_declared_registers_by_default() -> None:
+def test_a_request_includes_no_undeclared_addresses_by_default() -> None:
     drive = Meter(1)
     declared = {at for address in ADDRESSES.values() for at in (address, address + 1)}
     asked = [range(one.start, one.start + one.count) for one in blocks(drive, drive.readings())]
@@ -570,7 +570,7 @@ def test_one_register_of_a_group_can_be_read_without_the_others() -> None:
     assert [(one.block.start, one.block.count) for one in planned(Grouped(1), rates)] == [(0, 1), (60, 1)]
 
 
-def test_groups_in_read_together_come_before_other_registers() -> None:
+def test_registers_that_must_be_read_together_are_read_first() -> None:
     order = [block.registers[0].name for block in blocks(Grouped(1), Grouped.registers.values())]
     assert order[:2] == ["latch", "energy_high"]
     assert order[-1] == "other"
@@ -592,7 +592,9 @@ def test_groups_in_read_together_come_before_other_registers() -> None:
         ({"most_registers": {HOLDING: 0}}, "not a number from 1 to 125"),
     ],
 )
-def test_invalid_group_limit_or_pause_is_a_declaration_error(details: dict[str, Any], sentence: str) -> None:
+def test_an_invalid_group_limit_or_interval_is_a_declaration_error(
+    details: dict[str, Any], sentence: str
+) -> None:
     registers = {"a": reading(1), "b": reading(2), "far": reading(9), "input_3": reading(3, table=INPUT)}
     with pytest.raises(DeclarationError, match=sentence):
         family(**registers, run=command(4), **details)

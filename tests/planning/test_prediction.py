@@ -291,7 +291,7 @@ def test_prediction_depends_on_the_framing() -> None:
     assert predict(asked(rtu, None, "output_current")).cycle > 10e-3
 
 
-def test_suggested_changes_as_text_form_one_sentence() -> None:
+def test_the_text_of_suggested_changes_is_one_sentence() -> None:
     every = 'every = "100 ms" instead of 50 ms'
     found = Suggestions(((0.05, 0.1),), (19200, (YD1000(1, name="fan-1"), YD1000(2, name="fan-2"))), 3)
     assert str(found) == (
@@ -326,7 +326,7 @@ SENTENCE = (
 )
 
 
-def test_readable_gaps_would_save_a_fifth_of_a_meters_reading_time() -> None:
+def test_requests_across_gaps_save_a_fifth_of_the_time() -> None:
     drive = Meter(1, baudrate=9600, format="8N1")
     gain = reading_gain(drive, [(drive.register(name), None) for name in ADDRESSES])
     assert gain is not None
@@ -337,7 +337,7 @@ def test_readable_gaps_would_save_a_fifth_of_a_meters_reading_time() -> None:
     assert reading_gain(told, [(told.register(name), None) for name in ADDRESSES]) is None
 
 
-def test_readable_gaps_for_a_family_file_are_suggested_in_toml(tmp_path: Path) -> None:
+def test_a_suggestion_for_a_family_file_is_written_in_toml(tmp_path: Path) -> None:
     source = (
         "[family]\ntitle = 'Meter'\nmanual = 'of this test'\ncounts_from = 0\n[reading]\n"
         "low = { at = 1, unit = 'V' }\nhigh = { at = 3, unit = 'V' }\n"
@@ -353,7 +353,7 @@ def test_readable_gaps_for_a_family_file_are_suggested_in_toml(tmp_path: Path) -
     assert gains[1] is None
 
 
-def test_readable_gaps_are_not_suggested_if_declared_or_useless() -> None:
+def test_requests_across_gaps_are_not_suggested_if_declared_or_useless() -> None:
     class Compact(Drive):
         a = reading(1)
         b = reading(2)
@@ -376,7 +376,7 @@ def test_suggested_reads_do_not_exceed_the_read_limit_of_the_class() -> None:
     assert [len(gap) for _, gap in gain.gaps] == [1]
 
 
-def test_readable_gaps_are_suggested_only_for_a_users_own_class(
+def test_requests_across_gaps_are_suggested_only_for_a_users_own_class(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     plant = tmp_path / "hall.toml"
@@ -395,11 +395,13 @@ def test_readable_gaps_are_suggested_only_for_a_users_own_class(
         main(["models", model])
         told = " ".join(capsys.readouterr().out.split())
         assert "readable_gaps" not in told
-        # only shipped family files may state no limit, because some documents state none
+        # only shipped family files may leave out the read limit, because some manuals do not state it
         assert "the family states none" not in told or model in SHIPPED
 
 
-def test_plan_and_models_show_groups_and_pauses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_commands_plan_and_models_show_read_groups_and_intervals(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     source = (
         "from multidrop import Drive, reading\n"
         "class Own(Drive):\n"

@@ -109,7 +109,7 @@ def test_every_poll_gets_a_share_of_an_overloaded_line() -> None:
         assert counts[each] + each.skipped == pytest.approx(slots, abs=1)
 
 
-def test_polls_without_a_period_get_their_share_when_an_overload_starts() -> None:
+def test_polls_without_a_period_continue_when_an_overload_starts() -> None:
     made = schedule(turn := job(1, duration_ms=10))
     take(made, 0, 10_000)  # requests sent before the overload starts
     for drive in (2, 3):
@@ -118,7 +118,7 @@ def test_polls_without_a_period_get_their_share_when_an_overload_starts() -> Non
     assert taken.count(turn) >= 3000 / 10 * TURN_SHARE - 6
 
 
-def test_unused_share_of_polls_without_a_period_is_not_saved_up() -> None:
+def test_polls_without_a_period_do_not_save_up_unused_time() -> None:
     made = schedule(job(1, 10, duration_ms=10))
     take(made, 0, 10_000)
     made.add(turn := job(2, duration_ms=10), 10_000 * MS)
@@ -133,7 +133,7 @@ def test_polls_with_equal_line_settings_are_sent_in_a_row_if_none_is_late() -> N
     assert [each.skipped for each in jobs] == [0] * 20
 
 
-def test_poll_whose_slot_ends_soon_goes_before_polls_with_the_same_settings() -> None:
+def test_an_urgent_poll_goes_before_polls_with_the_present_line_settings() -> None:
     made = schedule(one := job(1, 30, 10, kind=1), *(job(drive, 1000, 10, kind=2) for drive in range(2, 12)))
     made.take(0, 0, 1, 1)
     waited = [sent - due for each, due, sent in carry_out(made, 1) if each is one]
@@ -174,7 +174,7 @@ def test_schedule_returns_at_least_one_request_even_if_it_is_long() -> None:
     assert take(made, 0, 1) == [(long, 0)]
 
 
-def test_queued_requests_count_towards_the_planning_horizon() -> None:
+def test_no_request_is_planned_if_queued_requests_last_until_the_horizon() -> None:
     made = schedule(job(1))
     assert made.take(0, 100 * MS, 100 * MS, 9) == []
     assert len(made.take(0, 90 * MS, 100 * MS, 9)) == 2
@@ -273,7 +273,7 @@ def test_drives_keep_97_percent_of_their_rate_beside_dead_drives(dead: int, peri
     assert answered[0] >= 0.97 * answered[1]
 
 
-def test_silent_drive_gets_one_request_and_all_its_polls_after_a_reply() -> None:
+def test_a_silent_drive_gets_a_single_request_until_it_answers() -> None:
     made = schedule(job(1), job(1), other := job(2))
     fail(made, 1, 2, now_ms=0)
     woken = take(made, 501, 50)
@@ -282,16 +282,17 @@ def test_silent_drive_gets_one_request_and_all_its_polls_after_a_reply() -> None
     assert len({each for each, _ in take(made, 520, 50)}) == 3
 
 
-def test_silent_drive_gets_its_shortest_request_whatever_its_rate() -> None:
+def test_a_silent_drive_gets_its_shortest_request_whatever_its_rate() -> None:
     made = schedule(job(1, 100, 20), short := job(1, 60_000, 7), job(1, None, 9))
     fail(made, 1, 2, now_ms=0)
     take(made, 1, 400)
-    assert take(made, 501, 50) == [(short, 0)]  # a request that tries a silent drive uses no slot of its job
+    # The retry of a silent drive is an extra request: the job is still due after 60 s.
+    assert take(made, 501, 50) == [(short, 0)]
     fail(made, 1, 0, now_ms=502)
     assert (short, 60_000) in take(made, 502, 60_000, most=10_000)
 
 
-def test_silent_drive_is_tried_in_the_spare_time_of_other_drives() -> None:
+def test_a_silent_drive_is_retried_in_the_spare_time_of_other_drives() -> None:
     made = schedule(dead := job(1), timed := job(2, 10, 5))
     fail(made, 1, 2, now_ms=0)
     take(made, 0, 450)
@@ -299,7 +300,7 @@ def test_silent_drive_is_tried_in_the_spare_time_of_other_drives() -> None:
     assert [each for each, _ in taken[:3]] == [timed, dead, timed]
 
 
-def test_silent_drive_is_tried_even_if_the_line_has_no_spare_time() -> None:
+def test_a_silent_drive_is_retried_even_without_spare_time() -> None:
     made = schedule(dead := job(1), job(2, 10, 10), job(3, 10, 10))
     fail(made, 1, 2, now_ms=0)
     asked = sum(dead in (each for each, _ in take(made, now, 100)) for now in range(0, 5000, 100))
@@ -321,14 +322,14 @@ def test_drive_gets_a_request_once_its_late_reply_has_come() -> None:
     assert poll in [each for each, _ in take(made, 100, 20)]
 
 
-def test_silent_drive_is_tried_once_after_its_late_reply() -> None:
+def test_a_silent_drive_is_retried_once_after_a_late_reply() -> None:
     made = schedule(poll := job(1), job(2))
     fail(made, 1, 2, now_ms=0, late_until_ms=900)
     fail(made, 1, 2, now_ms=100, late_until_ms=0)
     assert [each for each, _ in take(made, 100, 60)].count(poll) == 1
 
 
-def test_polls_with_the_present_line_settings_go_first_if_no_slot_is_missed() -> None:
+def test_polls_with_the_present_line_settings_go_first_if_time_permits() -> None:
     """If the time is a nanosecond too short, the job whose slot ends first is sent first."""
     for less, order in ((0, [2, 1]), (1, [1, 2])):
         made = schedule(job(3, 1000, 10, kind=2))
@@ -354,7 +355,7 @@ def test_due_poll_is_skipped_if_its_drive_falls_silent() -> None:
     assert {each for each, _ in take(made, 100, 20)} == {one, two}
 
 
-def test_a_paused_drive_is_left_out_of_the_round() -> None:
+def test_other_drives_are_polled_while_a_drive_is_paused() -> None:
     made = schedule(*(jobs := [job(drive, None, 10) for drive in range(3)]))
     fail(made, 1, 1, now_ms=0, late_until_ms=10_000)
     assert [each for each, _ in take(made, 0, 40)] == [jobs[0], jobs[2], jobs[0], jobs[2]]
@@ -389,7 +390,7 @@ def test_polls_of_a_silent_drive_are_reported_with_the_time_they_were_due() -> N
     assert made.unasked == [(poll, due * MS) for due in (0, 100, 200, 300)]
 
 
-def test_a_pause_reports_a_poll_without_a_period_once() -> None:
+def test_a_poll_without_a_period_is_missed_once_per_pause() -> None:
     made = schedule(poll := job(1), job(2))
     fail(made, 1, 2, now_ms=7)
     take(made, 8, 300)
@@ -407,7 +408,7 @@ def test_skipped_slots_are_those_that_were_due_but_not_requested() -> None:
     assert made.pass_slots(250 * MS) == [(poll, 100 * MS), (poll, 200 * MS)]
 
 
-def test_skipped_slots_include_polls_that_are_due_now_or_were_started() -> None:
+def test_a_poll_that_is_due_now_is_skipped_too() -> None:
     made = schedule(one := job(1, 100), two := job(2, 100), begun := job(3, 1000))
     assert [each for each, _ in take(made, 0, 100, most=2)] == [one, two]
     assert made.pass_slots(100 * MS) == [(begun, 0), (one, 100 * MS), (two, 100 * MS)]
@@ -459,7 +460,7 @@ def test_a_poll_without_a_period_gets_the_turn_of_the_poll_it_replaces() -> None
     assert [asked for asked, _ in take(made, 100, 15)] == [new, jobs[2], jobs[0]]
 
 
-def test_a_repeatable_cycle_needs_answering_drives_and_no_periods() -> None:
+def test_no_bus_cycle_is_repeated_with_silent_drives_or_periodic_polls() -> None:
     made = schedule(one := job(1), two := job(2))
     assert made.cycle(0) == [one, two]
     fail(made, 1, 0, now_ms=0)
@@ -612,7 +613,7 @@ class Operation(RuleBasedStateMachine):
                 # slots start at each multiple of the period
                 assert (due - self.added[each]) % each.period_ns == 0
                 assert due > max(self.slots[each], default=-1)  # each slot is taken once, in order
-                assert due > at - each.period_ns  # the slot has not ended: missed slots are not repeated
+                assert due > at - each.period_ns  # no request is made for a slot that has ended
                 self.slots[each].append(due)
             else:
                 self.slots[each].append(at)
@@ -664,7 +665,7 @@ def test_only_polls_within_the_planning_horizon_are_planned() -> None:
     assert take(made, 0, 100) == [(soon, 10)]
 
 
-def test_turns_continue_with_the_next_poll_after_one_is_removed() -> None:
+def test_the_order_of_polls_continues_after_a_poll_is_removed() -> None:
     first, second, third = job(1), job(2), job(3)
     made = schedule(first, second, third)
     assert take(made, 0, 1, 1) == [(first, 0)]
@@ -698,7 +699,7 @@ def test_new_drive_gets_one_request_until_its_result_is_known() -> None:
     assert [asked.drive for asked, _ in take(made, 0, 1000)] == [2, 1]
     assert take(made, 10, 1000) == []
     assert made.cycle(10 * MS) == []
-    # concluded without a valid answer, for example because the reply was damaged
+    # The request has ended without a valid reply, for example with a damaged one.
     made.back_off.conclude(one.drive)
     assert [asked for asked, _ in take(made, 20, 1000)] == [two]
     answer(made, two, 30)
@@ -730,7 +731,7 @@ def test_new_drive_that_does_not_reply_gets_no_more_requests_for_a_while() -> No
     assert set(made.cycle((60 + rest_ms) * MS)) == {dead, living}
 
 
-def test_few_silent_new_drives_get_a_second_request_immediately() -> None:
+def test_silent_new_drives_are_retried_immediately_if_this_takes_little_time() -> None:
     """The drives may exist, because their first request or reply may have been lost."""
     lost, living = job(1), job(2)
     for cost_ns, again in {400 * MS: {lost}, 400 * MS + 1: set()}.items():
@@ -747,7 +748,7 @@ def test_few_silent_new_drives_get_a_second_request_immediately() -> None:
         assert lost not in {asked for asked, _ in take(made, 230, 20)}
 
 
-def test_a_returning_drive_ends_the_pause_that_would_end_next() -> None:
+def test_a_reply_of_a_silent_drive_shortens_another_drives_pause() -> None:
     made = schedule(*(jobs := [job(drive) for drive in range(3)]))
     fail(made, 0, 2, 0, late_until_ms=300)
     fail(made, 1, 2, 100)
@@ -757,7 +758,7 @@ def test_a_returning_drive_ends_the_pause_that_would_end_next() -> None:
     assert {asked for asked, _ in take(made, 300, 50)} == {jobs[0], jobs[2]}
 
 
-def test_exactly_one_other_silent_drive_is_tried_when_one_answers_again() -> None:
+def test_a_reply_of_a_silent_drive_shortens_only_one_pause() -> None:
     made = schedule(*(jobs := [job(drive) for drive in range(4)]))
     for failures, drive in itertools.product((2, 3), (0, 1, 2)):
         made.back_off.observe(drive, failures, 0, late_until_ns=0, cost_ns=300 * MS)
@@ -768,7 +769,7 @@ def test_exactly_one_other_silent_drive_is_tried_when_one_answers_again() -> Non
     assert {asked for asked, _ in take(made, 1500, 1000)} == {jobs[2], jobs[3]}
 
 
-# ---- turns that were not carried out ----
+# ---- planned requests (turns) that were not sent ----
 
 
 def plans(made: Schedule[Job]) -> list[list[tuple[Job, int, int | None]]]:
@@ -776,7 +777,7 @@ def plans(made: Schedule[Job]) -> list[list[tuple[Job, int, int | None]]]:
     return [[*made.take(at * MS, at * MS, until * MS, 9)] for at, until in ((0, 12), (12, 60))]
 
 
-def test_unsent_turns_are_planned_again_in_the_same_slots_and_order() -> None:
+def test_requests_that_were_not_sent_are_planned_again_in_order() -> None:
     made = schedule(job(1, 40), job(2), job(3, 60), job(4))
     before = plans(made)
     assert [len(plan) for plan in before] == [3, 9]
@@ -787,7 +788,7 @@ def test_unsent_turns_are_planned_again_in_the_same_slots_and_order() -> None:
     assert [each.skipped for each in made.jobs] == [0, 0, 0, 0]
 
 
-def test_a_turn_of_a_removed_poll_is_not_planned_again() -> None:
+def test_an_unsent_request_of_a_removed_poll_is_dropped() -> None:
     made = schedule(timed := job(1, 40), job(2))
     turns = made.take(0, 0, 4 * MS, 1)
     assert [turn.job for turn in turns] == [timed]
@@ -796,11 +797,11 @@ def test_a_turn_of_a_removed_poll_is_not_planned_again() -> None:
     assert timed not in {each for each, _ in take(made, 0, 100)}
 
 
-def test_a_new_drive_is_asked_again_if_its_first_request_was_put_back() -> None:
+def test_a_new_drive_is_asked_again_if_its_request_was_not_sent() -> None:
     made = schedule(job(1, 40))
     made.back_off.meet(1)
     turns = made.take(0, 0, 4 * MS, 9)
     assert len(turns) == 1
-    assert take(made, 50, 4) == []  # waits for the result of the first request
+    assert take(made, 50, 4) == []  # no second request before the first one has a result
     made.put_back(turns)
     assert [due for _, due in take(made, 50, 4)] == [40]

@@ -171,7 +171,7 @@ address = 3
 """
 
 
-def test_silence_of_a_line_replaces_t3_5_but_not_a_longer_family_silence(load: Load) -> None:
+def test_a_line_does_not_shorten_the_silence_that_a_family_needs(load: Load) -> None:
     (line,) = load(SILENT).lines
     assert [polled.drive.needed_silence() for polled in line.drives] == pytest.approx([500e-6, 10e-3, 0])
     assert line.switching == 0
@@ -595,7 +595,7 @@ def test_invalid_durations_in_a_plant_file_are_refused(text: str) -> None:
         parse_duration(text)
 
 
-def test_a_drive_gets_its_ram_and_confirmed_keys_from_the_plant_file(tmp_path: Path) -> None:
+def test_the_options_of_a_drive_are_read_from_the_plant_file(tmp_path: Path) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(
         """
@@ -628,7 +628,7 @@ def two_lines(directory: Path) -> Path:
     return path
 
 
-def test_with_ports_changes_only_the_ports_of_lines(tmp_path: Path) -> None:
+def test_new_ports_change_nothing_else_in_a_plant(tmp_path: Path) -> None:
     plant = load_plant(two_lines(tmp_path))
     changed = plant.with_ports({"roof": "ports/roof"})
     assert [line.port for line in changed.lines] == ["/dev/hall", "ports/roof"]
@@ -637,7 +637,7 @@ def test_with_ports_changes_only_the_ports_of_lines(tmp_path: Path) -> None:
     assert plant.with_ports({"roof": "/dev/hall", "hall": "/dev/roof"}).lines[0].port == "/dev/roof"
 
 
-def test_with_ports_refuses_unknown_lines_and_duplicate_ports(tmp_path: Path) -> None:
+def test_unknown_lines_and_duplicate_new_ports_are_refused(tmp_path: Path) -> None:
     plant = load_plant(two_lines(tmp_path))
     with pytest.raises(ValueError, match=r"plant\.toml has no line 'rof'; did you mean roof\?"):
         plant.with_ports({"rof": "x"})

@@ -201,7 +201,7 @@ def test_toml_file_that_no_longer_exists_has_no_line_numbers(tmp_path: Path) -> 
     assert line_numbers(tmp_path) == {}
 
 
-def test_error_that_starts_with_a_toml_key_names_the_keys_line(tmp_path: Path) -> None:
+def test_an_error_that_starts_with_a_key_has_its_line_number(tmp_path: Path) -> None:
     (tmp_path / "a.toml").write_text("[a]\nb = 1\nc = 2\n")
     place = TomlPlace.in_file(tmp_path / "a.toml").within("[a]", "a")
     place.wrong("c = 2 is too much")

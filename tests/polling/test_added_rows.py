@@ -121,7 +121,7 @@ def test_channel_totals_continue_exactly_after_a_restart(port: str, tmp_path: Pa
     assert of(rows, "outage")[0].status == "pump-1.charge starts at 0"
 
 
-def test_adopt_continues_channel_totals_and_drops_removed_channels(port: str) -> None:
+def test_channel_totals_continue_after_a_change_to_another_plant(port: str) -> None:
     with Poller(plant(line(port, pump(CHARGE, DOUBLE)))) as poller:
         rows: list[Row] = []
         until(lambda: rows.extend(rows_of(poller)) or len(of(rows, "charge")) > 5)
@@ -185,7 +185,9 @@ def test_a_plant_with_a_mistake_in_a_channel_is_refused(port: str) -> None:
         poller.adopt(wrong)
 
 
-def test_no_channel_is_computed_of_an_unpolled_register(port: str, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_channel_is_not_computed_if_its_register_is_not_polled(
+    port: str, caplog: pytest.LogCaptureFixture
+) -> None:
     other = Channel("other", "pump-1.output_current", "A")
     made = plant(line(port, pump(), PolledDrive(Toy(2, name="pump-2"), [CURRENT], channels=[other])))
     with Poller(made) as poller, caplog.at_level(logging.WARNING):
@@ -292,7 +294,7 @@ def test_channel_totals_of_simulated_drives_are_saved_in_a_separate_file(
     )
 
 
-def test_a_comment_is_the_status_of_its_row(port: str) -> None:
+def test_the_text_of_a_comment_is_stored_in_the_status_column(port: str) -> None:
     rows = polled_rows(plant(line(port, pump())), 20, "a comment")
     assert "a comment" not in STATUSES
     assert "a comment" in {row.status for row in rows}
@@ -347,7 +349,7 @@ def test_rows_have_the_time_of_their_exchange_although_the_computer_slept(tmp_pa
             check=False,
         )
     assert ran.returncode == 0, ran.stderr
-    # growth of UTC minus monotonic time, in hours: in rows before the sleep (True) and after it (False)
+    # difference of UTC and monotonic time in hours, by whether the row is from before the sleep
     slept_for = {True: set[int](), False: set[int]()}
     # the request at `unsure_ns` may be before or after the sleep
     before_ns, unsure_ns = asked_ns[48], asked_ns[49]

@@ -256,7 +256,7 @@ def test_all_lines_can_be_replaced_by_other_lines() -> None:
 
 
 @pytest.mark.slow
-def test_a_plant_can_be_adopted_before_polling_starts() -> None:
+def test_a_poller_can_change_to_another_plant_before_polling_starts() -> None:
     made = clocked(hall(*pumps()))
     made.poller.adopt(plant(hall(toy("pump-1", 1, 0.2)), yard(*fans())))
     with made:

@@ -191,7 +191,7 @@ class Other(QuickToy):
     model = "other"
 
 
-def test_a_drive_of_a_changed_family_gets_no_stop_of_the_old_family(both: TwoLines) -> None:
+def test_no_stop_of_the_old_family_is_sent_after_a_family_change(both: TwoLines) -> None:
     with Poller(plant(both.hall(), both.yard())) as poller:
         poller.stop_on_exit()
         for name in ("hall", "yard"):
@@ -267,7 +267,9 @@ def test_removing_a_line_waits_for_its_stop(both: TwoLines, monkeypatch: pytest.
         assert list(poller.buses) == ["hall"]
 
 
-def test_a_drive_can_be_removed_during_another_stop(both: TwoLines, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_drive_can_be_removed_while_another_drive_is_being_stopped(
+    both: TwoLines, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with Poller(plant(both.hall())) as poller:
         pump_1, _ = poller.bus("hall").drives
         with blocked_stop(poller.bus("hall"), monkeypatch, pump_1.stop) as stopping:
@@ -295,7 +297,7 @@ def test_replaced_drives_stay_attached_during_stops(both: TwoLines, monkeypatch:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("is_circle", [False, True])
-def test_a_drive_can_be_stopped_until_its_new_name_is_free(
+def test_a_drive_can_be_stopped_while_it_waits_for_its_new_name(
     both: TwoLines, monkeypatch: pytest.MonkeyPatch, is_circle: bool
 ) -> None:
     """While `adopt` waits for a stop on the other line, the drive's motor can still be stopped."""
@@ -505,7 +507,7 @@ def test_a_summary_during_adopt_shows_either_the_old_or_the_new_plant(both: TwoL
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_a_hundred_adoptions_leak_no_thread_descriptor_or_memory(both: TwoLines) -> None:
+def test_a_hundred_plant_changes_leak_no_threads_descriptors_or_memory(both: TwoLines) -> None:
     """During the adoptions, threads read drives, statistics and batches. No value is misattributed."""
     held_by = {"pump-1": 1.0, "pump-2": 2.0, "fan-1": 3.0, "fan-2": 4.0}
     sims = [*both.pumps.values(), *both.fans.values()]

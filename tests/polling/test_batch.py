@@ -54,7 +54,7 @@ def test_batch_at_returns_the_rows_at_the_given_indices(places: list[int]) -> No
     assert rows_of(pa.record_batch(found)) == wanted
 
 
-def test_columns_of_the_wide_form_in_a_list_raise_type_error() -> None:
+def test_columns_of_the_wide_table_in_a_list_raise_type_error() -> None:
     with pytest.raises(TypeError, match=r"wide takes names of columns as separate arguments, not \['"):
         example().wide(cast(Any, ["pump-1.speed"]))
 
@@ -67,7 +67,7 @@ def test_pyarrow_reads_a_batch() -> None:
 
 
 @pytest.mark.slow
-def test_pyarrow_reads_a_batch_as_a_stream_and_its_schema() -> None:
+def test_pyarrow_reads_the_rows_and_the_schema_of_a_batch() -> None:
     table = pa.table(example())
     assert table.schema.equals(SCHEMA)
     assert rows_of(table) == EXAMPLE
@@ -247,7 +247,7 @@ def test_a_drive_is_found_by_its_name(poller: Poller) -> None:
         poller["pump-11"]
 
 
-def test_a_drive_is_added_with_names_of_its_registers(poller: Poller) -> None:
+def test_the_poll_list_of_an_added_drive_may_contain_names(poller: Poller) -> None:
     fan = poller.add("line", Toy(2, name="fan"), poll=["output_current", Polled(Toy.status)], every=0.05)
     assert poller["fan"] is fan
     (declared,) = (each for each in poller.plant.lines[0].drives if each.drive is fan)
@@ -398,12 +398,12 @@ def test_no_library_is_imported_before_it_is_needed() -> None:
     )
     told = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     late = {"pandas", "polars", "pyarrow", "numpy", "nanoarrow"}
-    # Most programs use neither family files nor captures.
+    # Most programs need neither the loader of family files nor the metadata of installed packages.
     late |= {"importlib.metadata", "multidrop.families.files.loader"}
     assert late.isdisjoint(told.stdout.split())
 
 
-def test_registers_of_one_request_share_a_row_of_the_wide_form() -> None:
+def test_registers_of_one_request_share_a_row_of_the_wide_table() -> None:
     wide = example().wide()
     assert wide.columns == [
         *("time", "monotonic_ns", PUMP, SPEED),
@@ -421,7 +421,7 @@ def test_registers_of_one_request_share_a_row_of_the_wide_form() -> None:
     assert table.column("monotonic_ns").to_pylist() == [second * SECOND for second in (1, 2, 3, 4)]
 
 
-def test_pandas_and_polars_read_the_wide_form() -> None:
+def test_pandas_and_polars_read_the_wide_table() -> None:
     pytest.importorskip("pandas", reason="needs pandas")
     polars = pytest.importorskip("polars", reason="needs polars")
     frame = example().wide(PUMP, SPEED).to_pandas()
@@ -437,7 +437,7 @@ def test_pandas_and_polars_read_the_wide_form() -> None:
     assert frame[SPEED].to_list() == [0.3]
 
 
-def test_the_wide_form_has_all_chosen_columns_in_the_chosen_order() -> None:
+def test_the_wide_table_has_all_chosen_columns_in_the_chosen_order() -> None:
     """All batches then have the same columns, even if a batch has no row of a register."""
 
     never = "насос.output_frequency"
@@ -448,7 +448,7 @@ def test_the_wide_form_has_all_chosen_columns_in_the_chosen_order() -> None:
     assert table.column(PUMP).to_pylist() == [49.99]
 
 
-def test_choosing_an_unknown_column_of_the_wide_form_raises_value_error() -> None:
+def test_an_unknown_column_of_the_wide_table_raises_value_error() -> None:
     with pytest.raises(ValueError, match=r"no column 'pump-1\.motor_sped'; did you mean pump-1\.motor_"):
         example().wide("pump-1.motor_sped")
     with pytest.raises(ValueError, match=r"there is no column 'x'; a column is DRIVE\.REGISTER"):
@@ -457,7 +457,7 @@ def test_choosing_an_unknown_column_of_the_wide_form_raises_value_error() -> Non
         example().wide(PUMP, PUMP)
 
 
-def test_rows_of_the_wide_form_are_sorted_by_time() -> None:
+def test_the_rows_of_the_wide_table_are_sorted_by_time() -> None:
     """Rows of two lines may arrive out of order; the table is sorted by time."""
     rows = [row(second, "pump", name, second) for name in ("b", "a") for second in (3.0, 1.0, 2.0)]
     table = pa.table(from_rows(rows).wide())
@@ -465,19 +465,19 @@ def test_rows_of_the_wide_form_are_sorted_by_time() -> None:
     assert table.column("monotonic_ns").to_pylist() == [SECOND, 2 * SECOND, 3 * SECOND]
 
 
-def test_the_wide_form_joins_only_rows_with_equal_times() -> None:
+def test_only_rows_with_equal_times_are_joined_in_the_wide_table() -> None:
     early = row(1.0, "pump", "a", 1.0)
     rows = [
         early,
         early._replace(register="b", time_ns=early.time_ns + 1, monotonic_ns=early.monotonic_ns + 1),
     ]
-    rows.append(rows[1]._replace(drive="fan"))  # a row of another line, at the same time to the nanosecond
+    rows.append(rows[1]._replace(drive="fan"))  # a row of another drive with equal times
     table = pa.table(from_rows(rows).wide())
     assert table.column("pump.a").to_pylist() == [1.0, None]
     assert table.column("pump.b").to_pylist() == table.column("fan.b").to_pylist() == [None, 1.0]
 
 
-def test_the_wide_form_joins_no_rows_with_different_monotonic_times() -> None:
+def test_rows_with_different_monotonic_times_are_not_joined_in_the_wide_table() -> None:
     """If UTC repeats, the monotonic time still distinguishes the rows."""
 
     first = row(1.0, "pump", "a", 1.0)
@@ -485,7 +485,7 @@ def test_the_wide_form_joins_no_rows_with_different_monotonic_times() -> None:
     assert table.column("pump.a").to_pylist() == [1.0, 2.0]
 
 
-def test_rows_after_a_restart_of_the_computer_are_last_in_the_wide_form() -> None:
+def test_rows_after_a_restart_of_the_computer_are_last_in_the_wide_table() -> None:
     """A restart sets the monotonic clock to 0. Without a restart, a late row is sorted by its time."""
     hour = 3600.0
     before = [row(at, "pump", "a", at) for at in (hour, hour + 200, hour + 100)]
@@ -497,7 +497,7 @@ def test_rows_after_a_restart_of_the_computer_are_last_in_the_wide_form() -> Non
     assert table.column("pump.a").to_pylist() == [hour, hour + 100, hour + 200, 7.0, 9.0]
 
 
-def test_a_missing_value_is_null_in_the_wide_form_and_replaces_no_value() -> None:
+def test_a_missing_value_replaces_no_value_in_the_wide_table() -> None:
     columns = Columns(4)
     assert add_rows(columns, block(0, 0), completion(SECOND, first_ns=SECOND, words=(100,)), UTC_0)
     assert add_miss(columns, block(0, 0), Status.NOT_ASKED, SECOND, UTC_0)
@@ -506,21 +506,21 @@ def test_a_missing_value_is_null_in_the_wide_form_and_replaces_no_value() -> Non
     assert table.column("p.r").to_pylist() == [1.0, None]
 
 
-def test_an_empty_batch_has_an_empty_wide_form() -> None:
+def test_an_empty_batch_has_an_empty_wide_table() -> None:
     wide = Batch(Columns(4), Names(["p"]), Names(["r"])).wide()
     assert (len(wide), wide.columns) == (0, ["time", "monotonic_ns"])
     assert pa.table(wide).num_rows == 0
     assert pa.table(Batch(Columns(4), Names(["p"]), Names(["r"])).wide("p.r")).num_rows == 0
 
 
-def test_equal_column_names_of_two_drives_in_the_wide_form_raise_value_error() -> None:
+def test_equal_column_names_of_two_drives_in_the_wide_table_raise_value_error() -> None:
     rows = from_rows([row(1.0, "a.b", "c", 1.0), row(1.0, "a", "b.c", 2.0)])
     with pytest.raises(ValueError, match=r"'a\.b' and 'a' both have a column that is called 'a\.b\.c'"):
         rows.wide()
 
 
 @pytest.mark.slow
-def test_the_wide_form_equals_the_pivot_of_pandas() -> None:
+def test_the_wide_table_equals_the_pivot_table_of_pandas() -> None:
     pandas = pytest.importorskip("pandas", reason="needs pandas")
     rows = [
         row(second / 7, f"pump-{second % 3}", name, float(second), "ok")

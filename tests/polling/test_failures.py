@@ -111,7 +111,8 @@ def test_a_failure_on_one_line_does_not_affect_other_lines(
     method: str,
     failure: BaseException,
 ) -> None:
-    for name in ("RETRY_NS", "LONGEST_RETRY_NS"):  # before each retry, a batch without values must arrive
+    # short pauses before retries, but long enough for a batch without values in each pause
+    for name in ("RETRY_NS", "LONGEST_RETRY_NS"):
         monkeypatch.setattr(polled_line, name, 200_000_000)
     two.until(("ill", "ok"), ("well", "ok"))
     with monkeypatch.context() as broken:
@@ -196,7 +197,7 @@ def failed(two: Two, monkeypatch: pytest.MonkeyPatch) -> Two:
     """A poller whose thread has ended with a failure, and that has rows queued."""
     two.until(("ill", "ok"), ("well", "ok"))
     taken = exchanges(two)
-    until(lambda: exchanges(two) >= taken + 2)  # now there are rows that were not taken
+    until(lambda: exchanges(two) >= taken + 2)  # leaves rows in the queue
     monkeypatch.setattr(clock, "sleep", lambda seconds: None)
     monkeypatch.setattr(RowQueue, "await_calls", two.fails)
     two.poller._call_thread()
@@ -210,7 +211,8 @@ def test_calls_of_a_failed_poller_raise_polling_failed(failed: Two, caplog: pyte
     poller = failed.poller
     assert repr(poller).startswith("<Poller polling has ended on all lines: Ill: of this line;")
     rows: list[Row] = []
-    with pytest.raises(PollingFailed) as raised:  # only after all queued rows were taken
+    # The exception is raised after all queued rows were taken.
+    with pytest.raises(PollingFailed) as raised:
         rows.extend(row for batch in poller.batches() for row in batch)
     assert rows
     assert isinstance(raised.value.__cause__, Ill)
@@ -347,7 +349,9 @@ def test_on_batch_rejects_async_and_generator_functions(two: Two, function: Any)
 
 
 @pytest.mark.parametrize("function", [wait, give, give_later])
-def test_a_wrapped_async_on_batch_function_fails_at_once(two: Two, function: Callable[[object], Any]) -> None:
+def test_a_lambda_that_calls_an_async_or_generator_function_fails_immediately(
+    two: Two, function: Callable[[object], Any]
+) -> None:
     two.poller.on_batch(lambda batch: function(batch))
     caller = two.poller._caller
     assert caller is not None

@@ -315,8 +315,8 @@ def test_a_lost_request_does_not_slow_a_drive_permanently(lost: int) -> None:
     assert wire.unanswered == 0
 
 
-def test_polling_continues_after_a_lost_request_if_known_counts_are_wrong() -> None:
-    """No reply has the raw counts that the family's class states for its registers."""
+def test_polling_continues_if_a_class_declares_wrong_raw_counts() -> None:
+    """After a lost request, no reply has a raw count that the class declares."""
     pump = MisprintedToy(1, name="pump")
     sim = SimulatedDrive(pump)
     sim["mystery"], sim["acceleration_time"] = 1234, 123.4

@@ -116,7 +116,7 @@ def test_a_plant_is_polled_only_by_the_lines_master(mastership: Mastership, ever
         hold(mastership)
         rows.settle("pump", "fan")
         mastership.end()
-        rows.settle_unpolled("pump")  # then the drives have received all earlier requests
+        rows.settle_unpolled("pump")  # returns once the drives have received all earlier requests
         asked = [sim.counters.requests for sim in sims]
         rows_of(poller)
         rows.until("fan", NOT_MASTER)
@@ -146,7 +146,7 @@ def test_a_process_that_is_not_master_gets_few_rows(mastership: Mastership, ever
         assert 0 < found <= most
 
 
-def test_the_summary_of_a_plant_without_mastership_counts_no_foreign_bytes() -> None:
+def test_the_summary_without_a_mastership_has_no_count_of_foreign_bytes() -> None:
     with lines(None) as (_, made), Poller(plant(*made)) as poller:
         Rows(poller).settle("pump")
         assert "foreign_bytes" not in poller.summary()["lines"]["hall"]
@@ -354,7 +354,7 @@ def test_a_port_handled_by_pyserial_is_refused_and_changes_nothing(mastership: M
 
 
 @pytest.mark.long
-def test_a_new_mastership_listens_again_before_its_first_request(mastership: Mastership) -> None:
+def test_the_first_request_after_a_new_mastership_waits_the_guard_time(mastership: Mastership) -> None:
     hold(mastership)
     wire = Wire([simulated(QuickToy(1))], unpaced=True)
     with Simulator([wire]), Bus(wire.path, mastership=mastership) as bus:

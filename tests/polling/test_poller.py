@@ -308,7 +308,7 @@ def reply_of(address: int, reply: bytes) -> bytes:
 OTHER = checksums.rtu("02 03 02 12 34")
 NOISE = bytes(at * 151 % 256 for at in range(4096))
 
-FAULTS = {  # for each fault: the bytes sent instead of the reply, and the statuses of the rows
+FAULTS = {  # for each fault: the bytes sent instead of the reply, and the statuses of the polled rows
     "cut off": (lambda reply: reply[:-1], {"reply cut short"}),
     "damaged": (lambda reply: reply[:-1] + bytes([reply[-1] ^ 1]), {"bad checksum"}),
     "twice": (lambda reply: 2 * reply, {"ok"}),
@@ -334,7 +334,7 @@ def test_each_fault_of_a_reply_gives_rows_with_its_status(fault: str, pump: Simu
     # A socket, because a pty's buffer is too small for the noise.
     wire = Faulty([pump], fate, unpaced=True, port="socket://127.0.0.1:0")
     with Simulator([wire]) as sim, Polling(line(sim.wires[0].path, polled(drive(), ONE))) as polling:
-        # counts all rows since the start: after three refusals, polling continues only once a minute
+        # two rows are enough: after three refusals, the register is polled only once a minute
         until(lambda: all(polling.statuses()[status] >= 2 for status in said))
     assert {row.value for row in polling.rows if row.status == "ok"} == ({3.25} if "ok" in said else set())
     polling.check(*said, *PIECES.get(fault, ()))
@@ -373,7 +373,8 @@ def test_replies_at_9600_baud_are_read_without_early_requests(pump: SimulatedDri
         polling.until("ok", 10 * len(Slow.readings()))
     misses = polling.statuses().total() - polling.statuses()["ok"]
     assert slow.counters.damaged == 0
-    assert slow.counters.early <= misses  # a request is only early after a late reply
+    # A request only interrupts the silence after a reply if the reply was late, which is a miss.
+    assert slow.counters.early <= misses
     polling.check("ok")
 
 
@@ -597,8 +598,10 @@ def test_a_request_without_reply_when_polling_ends_has_a_row(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("leaves", ["the poll", "the drive"])
-def test_a_slot_not_over_when_polling_ends_has_no_row(responder: tuple[int, str], leaves: str) -> None:
-    """Such a slot is not counted as a missing value either."""
+def test_a_poll_that_is_still_due_when_polling_ends_has_no_row(
+    responder: tuple[int, str], leaves: str
+) -> None:
+    """Such a poll is not counted as a missing value either."""
     master, path = responder
     first = polled(Patient(1, name="pump-1"), [Patient.fault], 60.0)
     second = polled(Patient(2, name="pump-2"), [Patient.fault], 60.0)

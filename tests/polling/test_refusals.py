@@ -75,7 +75,8 @@ def test_one_refused_register_hardly_delays_its_neighbours(every: float | None) 
     assert values(rows) == expected_values(set(range(WIDE)) - {7})
     assert told == ["pump-1.r7"]
     asked = {span for span in sim.asked if span != (7, 1)}
-    assert len(asked) <= 5  # r7 is isolated by 5 halvings of 24 registers, which leave 5 blocks
+    # 24 registers are halved 5 times to find r7, which leaves at most 5 blocks without r7
+    assert len(asked) <= 5
     assert all(row.value is not None for row in rows if row.register != "r7")
 
 
@@ -141,8 +142,8 @@ def test_a_device_that_ignores_long_requests_gets_shorter_ones(longest: int, eve
 
 
 @pytest.mark.long
-def test_probes_of_a_device_that_ignores_long_requests_keep_the_rate() -> None:
-    """A probe is a read of a single register, with the same period as the block."""
+def test_a_drive_that_ignores_long_requests_is_not_polled_too_often() -> None:
+    """An additional read of a single register, with the period of the block, finds this out."""
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive, silent_beyond=1)
     with clocked_line_of(drive, sim, every=5.0) as clocked:
@@ -227,7 +228,8 @@ def test_a_refused_register_is_skipped_and_its_neighbours_are_polled() -> None:
     assert set(seen) == set(POLLED) - {REFUSED.name}
     assert told["set_aside"] == ["pump-1.mystery"]
     queued_ahead = 256 * len(POLLED)
-    assert refused <= 2 * queued_ahead  # not more than the requests that were already queued
+    # at most the rows of two full queues of requests, with 256 requests each
+    assert refused <= 2 * queued_ahead
 
 
 class Moody(SimulatedDrive):
@@ -341,7 +343,7 @@ def test_polled_values_of_all_number_formats_are_correct() -> None:
     assert {row.status for row in last.values()} == {"ok"}
 
 
-def test_a_code_for_no_value_gives_a_row_with_that_reason() -> None:
+def test_a_register_without_a_valid_value_gives_a_row_that_says_so() -> None:
     sim = SimulatedDrive(Meter(1))
     sim["voltage"], sim["energy"], sim["probe"], sim["tariff"] = math.nan, None, None, None
     sim["power_scale"] = -32768

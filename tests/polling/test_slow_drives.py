@@ -220,8 +220,8 @@ def test_memory_is_bounded_if_a_response_delay_keeps_changing() -> None:
 
 
 @pytest.mark.slow
-def test_a_drives_blocks_change_only_if_others_are_faster(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Measured delays always vary a little. That alone must not change the blocks."""
+def test_the_requests_to_a_drive_change_only_if_others_are_faster(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Measured delays always vary a little. That alone must not change the requests."""
     drive = Wide(1, name="pump-1")
     sim = SimulatedDrive(Wide(1), response_delay=SOON)
     choose, chosen = JobMaker.plan, []
@@ -235,7 +235,7 @@ def test_a_drives_blocks_change_only_if_others_are_faster(monkeypatch: pytest.Mo
         assert len(chosen) == 2
 
 
-# ---- drives with a least interval between requests; it does not delay other drives ----
+# ---- drives that need a pause between requests (`least_interval`); it does not delay other drives ----
 
 
 INTERVAL = 0.1
@@ -294,7 +294,7 @@ def test_registers_with_a_least_interval_are_polled_equally_often(every: float |
 
 
 @pytest.mark.slow
-def test_a_drive_with_a_least_interval_hardly_slows_the_other_drives() -> None:
+def test_a_drive_that_needs_pauses_hardly_slows_the_other_drives() -> None:
     (drive, sim), (other, its_sim) = slow(), quick(2)
 
     def exchanges(*drives: Drive) -> int:
@@ -309,7 +309,7 @@ def test_a_drive_with_a_least_interval_hardly_slows_the_other_drives() -> None:
 
 
 @pytest.mark.slow
-def test_a_stop_is_the_first_request_to_its_drive_after_the_least_interval() -> None:
+def test_a_stop_is_the_first_request_after_the_drives_pause() -> None:
     (drive, sim), (other, its_sim) = slow(), quick(2)
     drives = [polled(drive, drive.readings()), polled(other, other.readings())]
     with ClockedLines(ClockedWire([sim, its_sim], Faults()), drives) as clocked:
@@ -374,7 +374,7 @@ def test_the_predicted_rate_includes_the_interval_between_requests() -> None:
     assert not hasty.fits
 
 
-def test_the_schedule_alternates_the_blocks_of_a_drive_with_a_least_interval() -> None:
+def test_all_requests_to_a_drive_that_needs_pauses_are_equally_frequent() -> None:
     """Takes ten thousand turns from a schedule, without a clock."""
     schedule: Schedule[Job] = Schedule()
     jobs = [Job(drive=1, period_ns=None, duration_ns=10, interval_ns=1000) for _ in range(5)]
@@ -395,7 +395,7 @@ def test_the_schedule_alternates_the_blocks_of_a_drive_with_a_least_interval() -
     assert not [gap for (sooner, _), (later, _) in pairwise(taken) if (gap := later - sooner) != 10]
 
 
-def test_a_schedule_has_no_cycle_while_a_drive_has_a_least_interval() -> None:
+def test_the_bus_cycle_is_not_repeated_while_a_drive_needs_pauses() -> None:
     schedule: Schedule[Job] = Schedule()
     first, second = (Job(drive=1, period_ns=None, duration_ns=10, interval_ns=1000) for _ in range(2))
     other = Job(drive=2, period_ns=None, duration_ns=10)
@@ -410,7 +410,7 @@ def test_a_schedule_has_no_cycle_while_a_drive_has_a_least_interval() -> None:
     assert schedule.cycle(0) == [other]
 
 
-def test_a_removed_job_is_not_sent_after_its_drives_interval() -> None:
+def test_a_removed_poll_is_not_sent_after_the_pause_of_its_drive() -> None:
     schedule: Schedule[Job] = Schedule()
     other = Job(drive=2, period_ns=None, duration_ns=10)
     first, second = (Job(drive=1, period_ns=None, duration_ns=10, interval_ns=1000) for _ in range(2))
@@ -422,10 +422,11 @@ def test_a_removed_job_is_not_sent_after_its_drives_interval() -> None:
     schedule.remove(other)
     assert [turn.job for turn in schedule.take(2010, 2010, 3011, 9)] == [first]
     schedule.back_off.observe(1, 1, 3020, late_until_ns=9000, cost_ns=0)
-    assert schedule.take(4020, 4020, 5000, 9) == []  # the interval ends now, but the drive is silent
+    # the drive's pause ends now, but the drive is silent
+    assert schedule.take(4020, 4020, 5000, 9) == []
 
 
-def test_the_drive_whose_interval_ends_first_gets_the_next_request() -> None:
+def test_the_drive_whose_pause_ends_first_gets_the_next_request() -> None:
     schedule: Schedule[Job] = Schedule()
     slow, fast = (
         Job(drive=drive, period_ns=None, duration_ns=10, interval_ns=1000 // drive) for drive in (1, 2)

@@ -85,7 +85,7 @@ dwell = "2 s"
 
 
 @pytest.mark.slow
-def test_a_repeated_phase_starts_writes_and_stops_several_drives(tmp_path: Path) -> None:
+def test_all_commands_of_a_phase_are_sent_in_each_repetition(tmp_path: Path) -> None:
     """The simulated drives record each write with its time: `control` 2 is REVERSE, 5 is STOP."""
     with simulated_test(write_test(tmp_path, CYCLE, fan=CHE, pump=CHE), speed=SPEED) as (plan, (fan, pump)):
         assert TestRun(plan, speed=SPEED).run().ok
@@ -137,11 +137,12 @@ def test_an_abort_stops_all_drives_and_says_why(kind: str, tmp_path: Path) -> No
     path = write_test(tmp_path, text, fan=CHE, pump=CHE)
     with simulated_test(path, speed=SPEED) as (plan, sims):
         sims[1].motor.target = 20.0
-        sims[1].motor.run()  # no step commands this drive
+        sims[1].motor.run()  # this drive gets no command in any step
         happened: list[bool] = []
 
         def happen(rows: object) -> None:
-            quiet = {"fault": "steps 1", "silence": "hold"}  # phases without commands, which would fail first
+            # phases without commands: in other phases, a command would fail first
+            quiet = {"fault": "steps 1", "silence": "hold"}
             is_due = test.phase == quiet.get(kind, test.phase)
             if sims[0].motor.energised and is_due and not happened:
                 happened.append(True)
@@ -294,7 +295,8 @@ def test_no_step_is_shortened_by_a_delay_of_the_run(tmp_path: Path, monkeypatch:
     ("silence", "seconds", "why"),
     [
         ("3 s", 4, "no value of fan came for 4"),
-        ("1 min", 6, "the run stood still for 6"),  # rows arrive immediately after the sleep
+        # rows arrive immediately after the sleep, so the limit `silence` is not reached
+        ("1 min", 6, "the run stood still for 6"),
     ],
 )
 def test_no_step_is_carried_out_after_the_computer_has_slept(
@@ -414,6 +416,7 @@ def test_a_busy_computer_aborts_only_the_run_of_a_real_drive(
 
 
 WAIT = 'dwell = "2 min"'
+# The run checks the identities of all drives that it will start. It is aborted before the start.
 WAITING = """
 [abort]
 {limits}
@@ -423,7 +426,7 @@ name = "wait"
 {step}
 [[phase.step]]
 start = ["a", "b", "c"]
-"""  # the test ends before this start, which makes the run check all drives' identities first
+"""
 
 
 class FarEnds:
@@ -437,7 +440,7 @@ class FarEnds:
         self.test = test
         self.sims: dict[str, Any] = {}
         self.requests: dict[str, list[Message]] = {}  # received requests by line
-        self.cause: dict[str, int] | None = None  # number of requests at the call of `happen`, by line
+        self.cause: dict[str, int] | None = None  # number of requests when the event happened, by line
         self.event: Callable[[FarEnds], object] | None = None  # called after two bus cycles of the first step
         self._left: dict[str, int] = {}  # number of requests until the event, by line
         self._monkeypatch = monkeypatch
@@ -687,7 +690,7 @@ SHORT = STEPS.replace('"2 s"', '"300 ms"')
 LONG = SHORT.replace("[20.0, 30.0]", str([20.0, 30.0] * 60))  # a setpoint every 300 ms, for 36 s
 FAST = CHE | {"baudrate": 38400}
 INTERRUPTED = 10  # number of interrupted processes per seed
-INTERRUPTED_TURNING = 8  # number of these whose motor turns
+INTERRUPTED_TURNING = 8  # number of processes that are interrupted while the motor turns
 
 
 @pytest.mark.long
