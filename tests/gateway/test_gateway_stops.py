@@ -341,7 +341,9 @@ def test_many_stops_of_a_silent_drive_do_not_delay_the_stop_of_another(gateway: 
 
 
 @pytest.mark.slow
-def test_only_one_of_many_coasts_is_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_of_nine_coast_commands_is_repeated_and_the_others_are_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     repeated: list[float | None] = []
     stop = commands.stop_drive
 

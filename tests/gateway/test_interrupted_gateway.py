@@ -26,7 +26,7 @@ from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.settings import ServeSettings
 from multidrop.sim import EncodedDrive, Simulator, Wire
 
-# Python may also interrupt the destructors of objects that an earlier interruption left behind.
+# Ctrl-C may also interrupt the destructor of an object. Python can only report this, and pytest then warns.
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 
 

@@ -215,7 +215,7 @@ def test_a_reload_applies_the_rights_and_host_names_of_serve(tmp_path: Path) -> 
         assert write("pump-2").json["done"] is True
 
 
-def test_before_a_restart_a_reload_gives_local_clients_no_further_rights(tmp_path: Path) -> None:
+def test_local_clients_get_no_rights_from_a_reload_that_needs_a_restart(tmp_path: Path) -> None:
     with served(tmp_path, "[serve]\nbehind_proxy = false\n") as gateway:
         edit(gateway, "behind_proxy = false\n", f"behind_proxy = true\n{MAY}")
         assert reload(gateway)["restart"] == ["behind_proxy of [serve] takes effect after a restart"]

@@ -294,7 +294,7 @@ async def test_a_drive_that_a_reload_adds_is_stopped_as_soon_as_it_is_attached()
     assert lines.begun == [None, new]
 
 
-async def test_only_the_named_drives_are_stopped_without_a_reload() -> None:
+async def test_a_stop_reaches_only_the_named_drives_while_no_reload_runs() -> None:
     lines = Lines(plant_of(PUMP, FAN))
     assert told(await stop_meant(lines, ["fan", "nobody"], lines.stop)) == {"fan": FAN}
     assert lines.begun == [FAN, None]

@@ -217,7 +217,7 @@ def test_serve_check_reports_mistakes_in_the_plant_file(run: Run, tmp_path: Path
 
 
 @pytest.mark.parametrize("command", ["check", "plan"])
-def test_other_commands_ignore_the_table_serve(run: Run, tmp_path: Path, command: str) -> None:
+def test_other_commands_ignore_the_serve_table(run: Run, tmp_path: Path, command: str) -> None:
     plant = written(tmp_path, '[serve]\nlisten = "localhost:80"\nnot_known = 1\n')
     status, out, errors = run(command, plant.path)
     assert (status, errors) == (0, "")
@@ -267,7 +267,7 @@ def test_a_demo_of_the_page_warns_about_ignored_options(run: Run, monkeypatch: p
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("words", [["demo", "--web"], ["serve", "--demo"]])
-def test_a_demo_of_the_web_page_is_live_and_local_users_may_stop_it(words: list[str]) -> None:
+def test_a_web_demo_shows_live_values_and_lets_local_users_write(words: list[str]) -> None:
     with BoundProcess([*MULTIDROP, *words, "--no-browser"], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         port = int(process.stdout.readline().strip().rstrip("/").rpartition(":")[2])
@@ -337,7 +337,7 @@ def test_a_line_whose_port_is_missing_is_polled_as_soon_as_the_port_appears(tmp_
 
 
 @pytest.mark.slow
-def test_the_reason_of_a_port_that_is_lost_later_is_reported(tmp_path: Path) -> None:
+def test_the_health_report_says_why_a_port_was_lost_after_the_start(tmp_path: Path) -> None:
     port = tmp_path / "hall"
     plant = written(tmp_path, SERVE, port=str(port))
     gateway = Gateway(plant, read_settings(plant, {}))

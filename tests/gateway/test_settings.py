@@ -27,7 +27,7 @@ def mistakes(folder: Path, serve: str) -> list[str]:
     return [start.sub("", mistake, count=1) for mistake in wrong.value.mistakes]
 
 
-def test_without_a_table_serve_only_this_machine_may_read_values(tmp_path: Path) -> None:
+def test_a_plant_file_without_serve_settings_lets_only_local_clients_read(tmp_path: Path) -> None:
     settings = read_settings(written(tmp_path), {})
     assert (settings.host, settings.port) == ("127.0.0.1", 8750)
     assert settings.may.without_token(is_loopback=True) is Right.LOOK
@@ -36,7 +36,7 @@ def test_without_a_table_serve_only_this_machine_may_read_values(tmp_path: Path)
     assert not (tmp_path / "audit.jsonl").exists()
 
 
-def test_all_keys_of_the_table_serve_are_read(tmp_path: Path) -> None:
+def test_all_keys_of_the_serve_table_are_read(tmp_path: Path) -> None:
     certificate(tmp_path, "own")
     (tmp_path / "tokens").write_text(f"# people\n\nanna stop {SHA}\nscada write {digest('other')}\n")
     serve = """
@@ -66,7 +66,7 @@ verbs = ["pump-1.start", "pump-2.reset_fault"]
     assert settings.may.without_token(is_loopback=False) is None
 
 
-def test_fourteen_mistakes_in_the_table_serve_are_reported_together(tmp_path: Path) -> None:
+def test_fourteen_mistakes_in_the_serve_table_are_reported_together(tmp_path: Path) -> None:
     (tmp_path / "tokens").write_text("anna stop 1234\nanna look\n")
     (tmp_path / "key.pem").write_text("no key\n")
     serve = """
@@ -140,7 +140,7 @@ units = { pump-1 = 700 } # wrong
 """
 
 
-def test_each_mistake_in_the_table_serve_names_the_line_of_its_key(tmp_path: Path) -> None:
+def test_each_mistake_in_the_serve_table_names_the_line_of_its_key(tmp_path: Path) -> None:
     plant = written(tmp_path, PLACED)
     with pytest.raises(PlantError) as wrong:
         read_settings(plant, {})
@@ -217,7 +217,7 @@ def test_an_entry_of_serve_may_without_a_matching_drive_is_refused(
     assert any(sentence in mistake for mistake in wrong.value.mistakes), wrong.value.mistakes
 
 
-def test_mistakes_in_lines_and_in_the_table_serve_are_reported_together(tmp_path: Path) -> None:
+def test_mistakes_in_lines_and_in_the_serve_table_are_reported_together(tmp_path: Path) -> None:
     serve = """
 [serve]
 listen = 80
@@ -346,17 +346,17 @@ def test_mistakes_in_triggers_are_reported(tmp_path: Path, keys: str, sentences:
         ),
     ],
 )
-def test_a_tcp_port_of_two_interfaces_is_reported(tmp_path: Path, serve: str, sentence: str) -> None:
+def test_a_tcp_port_in_two_settings_is_reported(tmp_path: Path, serve: str, sentence: str) -> None:
     assert mistakes(tmp_path, f"{serve}\n") == [f"{sentence}; choose another port"]
 
 
-def test_an_address_on_a_tcp_port_that_two_interfaces_use_is_reported_once(tmp_path: Path) -> None:
+def test_each_setting_with_a_used_tcp_port_is_reported_once(tmp_path: Path) -> None:
     serve = '[serve.modbus]\nlisten = "127.0.0.1:8750"\n[serve.opcua]\nlisten = "127.0.0.1:8750"\n'
     in_use = "listen: port 8750 is in use by listen of [serve]; choose another port"
     assert mistakes(tmp_path, serve) == [f"[serve.modbus]: {in_use}", f"[serve.opcua]: {in_use}"]
 
 
-def test_interfaces_may_use_the_same_tcp_port_on_different_addresses(tmp_path: Path) -> None:
+def test_two_settings_may_have_one_tcp_port_on_different_addresses(tmp_path: Path) -> None:
     serve = '[serve]\nlisten = "{}"\n[serve.modbus]\nlisten = "{}"\nclients = ["::1"]\n'
     for page, modbus in (("127.0.0.1", "127.0.0.2"), ("[::1]", "127.0.0.1"), ("[::1]", "0.0.0.0")):
         read_settings(written(tmp_path, serve.format(f"{page}:1502", f"{modbus}:1502")), {})
@@ -419,7 +419,7 @@ def test_credentials_and_the_state_folder_of_the_service_manager_are_used(tmp_pa
     assert settings.audit == state / "audit.jsonl"
 
 
-def test_the_setting_look_by_token_needs_a_token_file(tmp_path: Path) -> None:
+def test_a_setting_that_requires_tokens_needs_a_token_file(tmp_path: Path) -> None:
     (only,) = mistakes(tmp_path, '[serve.may]\nlook = "token"\n')
     assert only == ('[serve]: look = "token" of [serve.may] needs a file of tokens; add tokens = "tokens"')
 

@@ -54,7 +54,8 @@ def test_gateway_modules_start_tasks_and_threads_only_through_the_supervisor() -
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
             if isinstance(node, ast.Call) and ast.unparse(node.func).rpartition(".")[2] in STARTERS:
                 found.add(path.relative_to(root).as_posix())
-    assert found == {"opcua/server.py"}  # the OPC UA server cancels its own task when it closes
+    # This module starts a task in an overridden method of asyncua, which cancels the task itself.
+    assert found == {"opcua/server.py"}
 
 
 @pytest.fixture
@@ -288,7 +289,7 @@ async def test_a_dead_task_that_is_started_again_is_no_longer_reported() -> None
 
 
 @pytest.mark.parametrize("failure", [ValueError("no"), SystemExit("no"), StopIteration("no")])
-async def test_the_supervisor_raises_the_errors_of_the_function_it_runs(failure: BaseException) -> None:
+async def test_a_failure_of_a_supervised_function_is_raised_in_its_caller(failure: BaseException) -> None:
     def work() -> None:
         raise failure
 

@@ -291,7 +291,8 @@ def test_segments_beside_a_damaged_segment_are_read(tmp_path: Path) -> None:
 def test_an_incomplete_end_of_a_closed_segment_is_reported(tmp_path: Path) -> None:
     rows = [random_rows(number, NOON + number * 60 * SECOND, 120) for number in range(2)]
     record(tmp_path, rows)
-    for number in (2, 1):  # segment 2 may still grow, so only segment 1 is damaged
+    # Segment 2 is the newest one. Its incomplete end is no damage, because a recorder may still write to it.
+    for number in (2, 1):
         path = tmp_path / f"rows.0000000{number}.arrows"
         path.write_bytes(path.read_bytes() + b"\0" * 7)
         with History(tmp_path) as history:
@@ -313,7 +314,8 @@ def test_export_without_duckdb_uses_pyarrow(tmp_path: Path, monkeypatch: pytest.
                 flat(rows),
                 "pump-0.speed",
             )
-            assert history.export(tmp_path / "a.parquet") == 400  # pyarrow wrote the file
+            # pyarrow writes this file, because duckdb cannot be imported here
+            assert history.export(tmp_path / "a.parquet") == 400
     compact(tmp_path, 2)
     monkeypatch.setitem(sys.modules, "duckdb", None)
     with History(tmp_path) as history:

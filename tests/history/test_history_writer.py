@@ -87,8 +87,8 @@ def test_closing_a_history_writer_writes_all_rows(tmp_path: Path, writers: Write
     assert writer.state().dropped == 20
 
 
-def test_batches_of_two_pollers_are_recorded(tmp_path: Path, writers: Writers) -> None:
-    """In the batches of the two pollers, equal codes mean different names."""
+def test_batches_with_different_names_for_one_code_are_recorded(tmp_path: Path, writers: Writers) -> None:
+    """Batches come from several pollers, and each poller numbers its drives from 0."""
     writer = writers(tmp_path)
     taken = [
         batch(Names([name]), 0, range(20), NOON, SECOND) for name in ("pump-1", "fan", "pump-1", "mixer")
@@ -272,7 +272,7 @@ def test_a_failed_compaction_is_reported_and_started_again(
         assert sorted(rows_in(history)) == sorted(rows)
 
 
-def test_error_output_of_a_compaction_that_is_not_utf_8_is_reported(
+def test_a_compaction_error_with_invalid_utf_8_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     program = tmp_path / "python"
@@ -318,7 +318,7 @@ def killed_recorder(folder: Path, run: int, dice: random.Random) -> int:
             check_runs(history, {}, NOON + run * RUN)
         time.sleep(dice.uniform(0, 1.2))
         if dice.random() < 0.5:
-            child.kill()  # the recorder's child process still compacts
+            child.kill()  # kills only the recorder: its child process, which compacts files, lives on
         else:
             os.killpg(child.pid, signal.SIGKILL)
         said = child.stdout.read().split("\n")[:-1]

@@ -75,7 +75,7 @@ def of(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("points", [300, 30])
-def test_summaries_leave_out_values_in_earlier_units(tmp_path: Path, how: str, points: int) -> None:
+def test_a_summary_leaves_out_values_in_an_earlier_unit(tmp_path: Path, how: str, points: int) -> None:
     recorded(tmp_path, AMPERE, PERCENT, AMPERE, PERCENT)
     kept(tmp_path, how, 4)
     found, other = of(tmp_path, points)

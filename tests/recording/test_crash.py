@@ -162,8 +162,8 @@ def test_rows_that_a_killed_client_reported_are_recorded_exactly_once(
     rows = 0
     acknowledged: list[int] = []
     for life in range(kills):
-        # The last write of a killed client may still be on the line. Skip its number: the next client would
-        # read its own number from the drive, send no write, and leave no record in the audit log.
+        # The last write of a killed client may still reach the drive, so the next client must not write the
+        # same number. It would find that number in the drive already, and would neither write nor log it.
         next_number = counting.numbers[-1] + 2 if counting.numbers else 1
         lines, seconds = chance.randint(0, MOST_TOLD), chance.uniform(0.0, LONGEST_WAIT)
         died_of = nursery.live(str(life), next_number, lines, seconds)

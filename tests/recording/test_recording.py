@@ -519,7 +519,7 @@ def test_a_stream_rewritten_by_another_program_is_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("count", [255, 256, 257, 1000])
-def test_more_statuses_than_a_byte_has_values_are_recorded(tmp_path: Path, count: int) -> None:
+def test_up_to_1000_different_statuses_are_recorded(tmp_path: Path, count: int) -> None:
     some = [Row(at, at, None, "a", "b", None, f"status {at % count}") for at in range(2500)]
     path = tmp_path / "a.arrows"
     with open_writer(path, {}) as writer:

@@ -258,7 +258,7 @@ except RecordingError as failure:
 @pytest.mark.slow
 @pytest.mark.uncounted
 @pytest.mark.parametrize("suffix", usually(*FORMATS))
-def test_a_disk_that_becomes_full_keeps_the_earlier_rows(tmp_path: Path, suffix: str) -> None:
+def test_the_error_about_a_full_disk_says_how_many_rows_are_saved(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
     command = [sys.executable, "-W", "error", "-c", FILL_THE_DISK, str(path), *SUPPORT]
     done = subprocess.run(command, capture_output=True, text=True, check=True)

@@ -403,7 +403,7 @@ def test_each_row_has_the_phase_in_which_it_was_requested(suffix: str, tmp_path:
             assert found[found.drive == "test"].value.to_list() == [0.0, 1.0]
 
 
-def test_recording_without_phases_has_no_column_phase(tmp_path: Path) -> None:
+def test_a_recording_without_test_phases_has_no_column_phase(tmp_path: Path) -> None:
     pytest.importorskip("pandas")
     path = tmp_path / "run.csv"
     with open_writer(path, ABOUT) as writer:

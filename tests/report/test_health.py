@@ -160,7 +160,7 @@ def test_missed_values_that_increase_with_motor_speed_are_found(look: Recording)
     assert miss_shares(look, "fan") is None
 
 
-def test_missed_values_are_not_sorted_by_a_constant_output_frequency(tmp_path: Path) -> None:
+def test_the_share_of_missed_values_is_unknown_at_a_constant_frequency(tmp_path: Path) -> None:
     rows = [row(at, "pump", "output_frequency", 50.0) for at in range(50)]
     rows.append(row(50, "pump", "output_frequency", None, "bad checksum"))
     assert miss_shares(load(record(tmp_path / "it.arrows", rows)), "pump") is None
@@ -184,8 +184,8 @@ def test_rare_reasons_for_missed_values_are_drawn_as_other_reasons(tmp_path: Pat
 def test_a_recording_gives_the_utilisation(planned: dict[str, Any], turns: list[Row], tmp_path: Path) -> None:
     look = load(record(tmp_path / "it.arrows", turns, ABOUT | {"planned": planned}))
     (line,) = line_uses(look)
-    # An exchange with the pump takes 14 ms up to the reply's first character, and 8 ms for the others.
-    # One with the fan takes 13 ms and 6 ms. A silence follows: 10 ms before or after the fan, otherwise 4 ms.
+    # Pump: 14 ms from the request to the reply's first character, and 8 ms for the reply's other characters.
+    # Fan: 13 ms and 6 ms. The line is then silent, for 10 ms before or after the fan, otherwise for 4 ms.
     assert line.needed[1:99] == pytest.approx(np.array([0.029, 0.032] * 49))
     assert line.needed[101:] == pytest.approx(np.full(49, 0.026))
     assert line.utilisation == pytest.approx((50 * 0.029 + 50 * 0.032 + 50 * 0.026) / 9.976, rel=0.01)
@@ -252,7 +252,9 @@ def test_a_line_whose_registers_have_polling_rates_has_no_bus_cycle(
     assert "bus cycle" not in report_page(look)
 
 
-def test_a_plan_without_rates_is_left_out(planned: dict[str, Any], turns: list[Row], tmp_path: Path) -> None:
+def test_utilisation_is_unknown_if_the_plan_lacks_polling_periods(
+    planned: dict[str, Any], turns: list[Row], tmp_path: Path
+) -> None:
     del planned["hall-1"]["drives"]["fan"]["blocks"][0]["every_ms"]
     look = load(record(tmp_path / "it.arrows", turns, ABOUT | {"planned": planned}))
     assert line_uses(look) == []

@@ -220,7 +220,7 @@ def by_pandas(table: Any, edge: float, step: float) -> tuple[Any, ...]:
     return known.count(), known.mean(), known.min(), known.max(), settling, slope, energy
 
 
-def test_figures_of_a_step_equal_those_computed_with_pandas(tmp_path: Path) -> None:
+def test_the_statistics_of_a_test_step_equal_those_computed_with_pandas(tmp_path: Path) -> None:
     pytest.importorskip("pandas")
     path = tmp_path / "run.arrows"
     recorded_run(path)

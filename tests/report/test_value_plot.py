@@ -192,7 +192,7 @@ def drawn(axes: Any) -> dict[str, list[tuple[str, float, float]]]:
     return lanes
 
 
-def test_states_are_drawn_in_a_lane_per_drive_with_its_names(tmp_path: Path) -> None:
+def test_the_states_of_each_drive_are_drawn_in_a_row_with_their_names(tmp_path: Path) -> None:
     """The raw value 3 means decelerating on one drive, and standby on the other."""
     rows = [row(at, "erman", "status", value) for at, value in enumerate((0, 2, 1, 3, 3, 3))]
     rows += [row(at, "che", "status", value) for at, value in enumerate((3, 3, 1, None, 3, 7))]

@@ -75,7 +75,7 @@ class Gateway:
         self._logged: dict[str, float] = {}
         self.begun = self.clock()
         self._looked = 0.0
-        self._has_news = False  # True: something has changed since the newest message to the page
+        self._has_news = False  # True: the plant's state has changed since the newest frame was made
         self.ledger = ledger or Ledger()
         self.poller: Poller | None = None  # None before polling starts
         self._made: Poller | None = None  # the poller, also while it is still starting

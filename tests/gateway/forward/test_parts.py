@@ -98,7 +98,9 @@ from multidrop.samples import SpoolState, unpack
         ('[serve.mqtt]\nrows = true\nmost = "1"', "[serve.mqtt]: most = invalid size '1': write 1 kB or"),
     ],
 )
-def test_a_forwarding_mistake_is_reported_in_one_sentence(tmp_path: Path, serve: str, mistake: str) -> None:
+def test_a_mistake_in_database_or_upload_settings_is_reported_in_one_sentence(
+    tmp_path: Path, serve: str, mistake: str
+) -> None:
     with pytest.raises(PlantError) as wrong:
         read_settings(written(tmp_path, serve), {})
     [found] = wrong.value.mistakes

@@ -172,7 +172,7 @@ def test_a_receiver_gets_all_rows_with_and_without_values(tmp_path: Path, kind: 
 
 
 @pytest.mark.slow
-def test_postgres_stores_the_rows_and_the_position_of_the_forwarder(tmp_path: Path) -> None:
+def test_a_postgres_database_stores_rows_and_the_newest_message_number(tmp_path: Path) -> None:
     """The gateway's database user either may create a schema, or owns one."""
     with postgres() as database:
         database.ask("create role gateway login")

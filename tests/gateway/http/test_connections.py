@@ -254,7 +254,7 @@ def test_a_connection_whose_client_reads_no_answers_is_closed(
 
 
 @pytest.mark.long
-async def test_http_stops_of_a_silent_drive_share_calls(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_further_http_stops_of_a_silent_drive_are_sent_as_one(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(web, "HEAD_S", 0.01)
     called, silent = list[list[str]](), asyncio.Event()
 

@@ -330,7 +330,7 @@ def test_callers_behind_a_proxy_do_not_count_as_local(tmp_path: Path) -> None:
         assert gateway.gateway.commands.called == 0
 
 
-def test_wrong_tokens_behind_a_proxy_block_only_their_senders_address(tmp_path: Path) -> None:
+def test_only_the_sender_of_wrong_tokens_is_blocked_behind_a_proxy(tmp_path: Path) -> None:
     """A proxy such as HAProxy appends its X-Forwarded-For header to the client's own."""
     with served(tmp_path, CLOSED, behind_proxy=True) as gateway:
         for at in range(MOST_WRONG):

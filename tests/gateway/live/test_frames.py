@@ -95,8 +95,8 @@ async def test_at_most_five_messages_are_made_per_second(
     assert 45 <= len(made) <= 51
 
 
-async def test_rows_that_arrive_before_a_message_is_due_are_in_the_next(frames: Frames, clock: Clock) -> None:
-    """The next message to the page is made even if no further rows arrive."""
+async def test_new_rows_are_sent_as_soon_as_the_next_message_is_due(frames: Frames, clock: Clock) -> None:
+    """The message is made even if no further rows arrive."""
     first = await frames.after(-1)
     assert first is not None
     frames.note_news()
@@ -119,7 +119,7 @@ def test_no_message_is_made_without_viewers(frames: Frames, clock: Clock, made: 
 async def test_a_viewer_that_was_away_gets_the_newest_message(frames: Frames, clock: Clock) -> None:
     first = await frames.after(-1)
     assert first is not None
-    for _ in range(50):  # during this time, the viewer that has the first frame asks for no other
+    for _ in range(50):  # newer messages, which the viewer does not request
         clock.now += 0.25
         frames.note_news()
         await frames.after(-1)

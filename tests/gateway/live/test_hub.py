@@ -251,7 +251,7 @@ def test_values_of_an_overloaded_line_stay_fresh_for_three_cycles(tmp_path: Path
 
 def test_the_last_minute_has_one_point_a_second_and_null_for_failed_reads(hub: Hub) -> None:
     assert hub.last_minute() == {}
-    for at in range(0, 1000, 5):  # 100 s: 1000 periods of 100 ms
+    for at in range(0, 1000, 5):  # time in units of 100 ms, so 100 s in all
         hub.take(rows((at, FREQUENCY, Status.NO_REPLY if at == 990 else at)))
         hub.note_minute()
     points = hub.last_minute()["pump-1"]["output_frequency"]

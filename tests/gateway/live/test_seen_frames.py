@@ -59,7 +59,7 @@ def times() -> Times:
     return Times()
 
 
-def test_a_command_is_refused_if_its_message_to_the_page_is_too_old(times: Times) -> None:
+def test_a_command_is_refused_if_its_sender_saw_only_old_values(times: Times) -> None:
     times.frames.note(7)
     made_ns = times.now_ns
     times.now_ns += MOST_AGE_NS
@@ -83,7 +83,7 @@ def test_a_stop_invalidates_earlier_commands_of_its_own_drive_only(times: Times)
     assert times.rule(8) == ""
 
 
-def test_a_command_is_refused_if_a_reload_followed_its_message(times: Times) -> None:
+def test_a_command_is_refused_if_its_sender_saw_no_values_since_a_reload(times: Times) -> None:
     times.frames.note(7)
     times.commands.plant_ns = times.now_ns
     assert times.rule(7) == times.rule(7, "pump-2") == ANOTHER_PLANT

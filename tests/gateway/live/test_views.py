@@ -305,7 +305,7 @@ def test_the_last_hour_has_60_minutes_of_statistics(recent: RecentStatistics) ->
     assert recent.hour("roof") == []
 
 
-def test_statistics_of_a_line_cover_the_last_seconds(recent: RecentStatistics) -> None:
+def test_the_statistics_of_a_line_leave_out_old_readings(recent: RecentStatistics) -> None:
     for second in range(200):
         recent.tick(float(second), second * 1000, {"hall": reading(second)})
         if second == 100:
@@ -316,11 +316,13 @@ def test_statistics_of_a_line_cover_the_last_seconds(recent: RecentStatistics) -
 
 
 @pytest.mark.parametrize("by_s", [-3600, 3600])
-def test_the_last_minute_is_a_minute_although_the_clock_is_set(recent: RecentStatistics, by_s: int) -> None:
+def test_the_statistics_of_a_line_are_right_although_the_clock_is_set(
+    recent: RecentStatistics, by_s: int
+) -> None:
     for second in range(600):
         utc_s = second + (by_s if second >= 90 else 0)
         recent.tick(float(second), utc_s * 1000, {"hall": reading(second)})
-    assert recent.line("hall")["misses"] == 3  # of 90 to 120 s
+    assert recent.line("hall")["misses"] == 3  # number of misses in 90 to 120 s
     assert {one["asked"] for one in recent.hour("hall")[:-1]} == {602}
 
 
@@ -443,7 +445,7 @@ def test_a_wrong_identity_is_logged_once(caplog: pytest.LogCaptureFixture) -> No
     bus = AskedBus(failures)
     with caplog.at_level(logging.WARNING):
         assert ask_all(bus, lambda name: True, *failures, "pump-1") == ["failed", "failed"]
-    # the supervisor may log that a thread ended after this test's event loop
+    # Leave out the supervisor's log lines: it may report threads that end later than this test's event loop.
     told = [one.message for one in caplog.records if one.name == "multidrop.gateway"]
     assert told == [str(stranger)]
     assert bus.names == [*failures, "pump-1"] * 2

@@ -201,7 +201,9 @@ def get(gateway: Any, path: str) -> Any:
 @pytest.mark.parametrize(
     ("passing", "master"), [("off", "pymodbus"), *usually(*(("declared", name) for name in MASTERS))]
 )
-def test_values_by_the_address_map_equal_those_of_the_page(tmp_path: Path, passing: str, master: str) -> None:
+def test_modbus_values_at_mapped_addresses_equal_those_of_the_web_page(
+    tmp_path: Path, passing: str, master: str
+) -> None:
     with served(tmp_path, passing) as (gateway, _), closing(Client(master, tmp_path)) as client:
         rows = get(gateway, "/api/modbus-map")
         until(lambda: None not in [one[0] for drive in values(gateway).values() for one in drive.values()])
@@ -303,7 +305,7 @@ def test_http_and_cli_give_the_same_address_map(tmp_path: Path, capsys: pytest.C
     assert "map.xls: the name of an address map must end in .csv or .json" in capsys.readouterr().err
 
 
-def test_the_address_map_states_invalid_counts_and_bit_ranges_of_registers(tmp_path: Path) -> None:
+def test_the_address_map_shows_the_invalid_values_and_bits_of_registers(tmp_path: Path) -> None:
     (tmp_path / "mixed.toml").write_text(FAMILY)
     (tmp_path / "plant.toml").write_text(PLANT.format(passing="declared", hall="/dev/a", yard="/dev/b"))
     assert main(["serve", str(tmp_path / "plant.toml"), "--modbus-map", str(tmp_path / "map.json")]) == 0

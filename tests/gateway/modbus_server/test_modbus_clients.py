@@ -184,7 +184,7 @@ def writes(first: int, end: int) -> bytes:
 
 
 @pytest.mark.parametrize("is_stalled", [False, True])
-async def test_writes_start_on_arrival_and_in_their_order(is_stalled: bool) -> None:
+async def test_a_clients_writes_start_in_order_and_before_waiting_reads(is_stalled: bool) -> None:
     begun: list[int] = []
 
     def noted(found: MbapRequest, _: ModbusClient) -> bytes:
@@ -203,7 +203,9 @@ async def test_writes_start_on_arrival_and_in_their_order(is_stalled: bool) -> N
 
 
 @pytest.mark.parametrize("frames", [reads, writes])
-async def test_slow_answers_to_a_client_are_sent_in_turns(frames: Callable[[int, int], bytes]) -> None:
+async def test_a_long_queue_of_requests_is_answered_in_several_steps(
+    frames: Callable[[int, int], bytes],
+) -> None:
     client, transport = connected(port_of(slowly))
     client.data_received(frames(0, 100))
     assert len(transactions(transport.written)) < 10
@@ -375,7 +377,7 @@ def test_a_stop_waits_neither_for_earlier_requests_nor_until_answers_are_read() 
             assert stopped.wait(PATIENCE)
 
 
-# number of addresses of each drive that are polled, and that are passed on to the drive
+# numbers of a drive's registers: polled ones, and those that are read from the drive for each request
 POLLED, PASSED = 500, 40
 CLIENTS = 3
 WINDOW = 200  # requests sent before the client reads their answers

@@ -118,13 +118,13 @@ def test_undeclared_addresses_are_refused_by_default(gateway: Gateway) -> None:
     assert gateway.line.asked == []
 
 
-def test_clients_may_read_undeclared_addresses_if_passing_is_any() -> None:
+def test_undeclared_registers_can_be_read_if_all_reads_are_passed_on() -> None:
     with serving(plant(), ModbusSettings(listen="127.0.0.1:0", passing="any")) as gateway:
         assert code(gateway, 1, 4, 0x7000, 2) is None
         assert gateway.line.asked == [("mill", 4, 0x7000, 2)]
 
 
-def test_a_read_causes_no_request_on_the_line_if_passing_is_off() -> None:
+def test_a_read_causes_no_request_on_the_line_if_none_is_passed_on() -> None:
     with serving(plant(), ModbusSettings(listen="127.0.0.1:0", passing="off")) as gateway:
         gateway.hub.values["mill", "output_voltage"] = 231.0
         assert code(gateway, 1, 3, CHE_OUTPUT_VOLTAGE, 1) is None
@@ -226,7 +226,9 @@ FAILURES = [
 
 
 @pytest.mark.parametrize(("failure", "expected"), FAILURES, ids=lambda one: type(one).__name__)
-def test_a_failed_read_has_its_exception_code(gateway: Gateway, failure: Exception, expected: int) -> None:
+def test_a_client_gets_the_exception_code_for_its_failed_read(
+    gateway: Gateway, failure: Exception, expected: int
+) -> None:
     gateway.hub.values.clear()
     gateway.line.failure = failure
     assert code(gateway, 1, 3, CHE_OUTPUT_VOLTAGE, 1) == expected
@@ -272,7 +274,7 @@ def test_a_write_is_carried_out_by_the_gateways_commands_and_echoed(gateway: Gat
         (6, (3, 1), b"", 2),  # this write has only the second half of a 32-bit register
         (16, (2, 1), b"\2\0\1", 3),
         (16, (2, 3), b"\6" + bytes(6), 3),  # one word more than the register has
-        (16, (2, 2), b"\4\0\0\0", 3),  # two bytes fewer than announced
+        (16, (2, 2), b"\4\0\0\0", 3),  # three bytes of data, although the count before them is four
         (16, (2, 2), b"\2\0\0\0\0", 3),
         (16, (2, 0), b"\0", 3),
         (16, (2, 124), b"\xf8" + bytes(247), 3),
@@ -298,7 +300,7 @@ def test_invalid_writes_are_refused(
 
 
 @table(("address", "words"), [(CHE_CONTROL, (1, 5)), (CHE_CONTROL - 1, (5, 1)), (CHE_SETPOINT, (5, 5))])
-def test_a_write_of_two_registers_without_a_stop_is_refused(
+def test_a_write_of_two_registers_is_refused_unless_it_contains_a_stop(
     gateway: Gateway, address: int, words: tuple[int, int]
 ) -> None:
     assert code(gateway, 1, 16, address, 2, data=struct.pack(">B2H", 4, *words)) in (2, 3)
@@ -385,7 +387,8 @@ def test_each_write_that_means_stop_calls_a_stop(gateway: Gateway) -> None:
         assert client.ask(3, 6, IBD_CONTROL, IBD_STOP).code is None
         assert client.ask(3, 6, IBD_CONTROL, 0).code == 3  # 0 is "no command", which stops no motor
         for yes in (1, 2, 0xFF00, 0xFFFF):  # values that masters write for "true"
-            # accepted although this drive uses Delixi's own protocol
+            # This register of the gateway stops a drive. It is at the same address for every drive, even for
+            # this one, which does not use Modbus.
             assert client.ask(4, 6, BLOCK + 10, yes).code is None
     stopped = [drives for drives, _ in gateway.commands.stopped]
     assert stopped == [["mill"]] * 4 + [["pump"]] + [["belt"]] * 4
@@ -497,7 +500,7 @@ def test_a_failed_stop_has_an_exception_code(gateway: Gateway, failure: BusError
     assert code(gateway, 1, 6, CHE_CONTROL, 5) == expected
 
 
-def test_a_stops_unexpected_error_is_logged(gateway: Gateway, caplog: pytest.LogCaptureFixture) -> None:
+def test_an_unexpected_error_of_a_stop_is_logged(gateway: Gateway, caplog: pytest.LogCaptureFixture) -> None:
     async def fails() -> CommandResult:
         raise RuntimeError("a mistake of ours")
 

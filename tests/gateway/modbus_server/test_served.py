@@ -110,7 +110,7 @@ def test_a_tcp_port_in_use_is_reported_before_polling_starts(tmp_path: Path) -> 
         assert drive.counters.requests == 0
 
 
-def test_mistakes_in_the_table_serve_modbus_are_reported_with_their_place(tmp_path: Path) -> None:
+def test_mistakes_in_the_modbus_settings_are_reported_with_their_place(tmp_path: Path) -> None:
     with simulated_plant(tmp_path) as (_, path):
         text = path.read_text()
         path.write_text(

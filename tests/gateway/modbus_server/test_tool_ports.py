@@ -372,7 +372,8 @@ def test_a_connection_is_accepted_after_a_failed_attempt(rig: Rig, monkeypatch: 
         until(lambda: failures)
         with opened(str(rig.link)) as other:
             assert ask(other, "01 03 00 10 00 01") == bytes.fromhex("01 03 02 0010")
-        assert len(failures) < 10  # few attempts, so the event loop stays free
+        # The port pauses after each failed attempt to accept the connection, so the event loop stays free.
+        assert len(failures) < 10
     with tool:
         assert ask(tool.fileno(), "01 03 00 10 00 01") == bytes.fromhex("01 03 02 0010")
 
@@ -421,7 +422,9 @@ def test_a_symlink_is_replaced_only_if_a_killed_gateway_made_it(tmp_path: Path) 
         ('pty = { hall = "p" }\nbaud = 9600', "baud"),
     ],
 )
-def test_each_mistaken_tool_port_setting_is_reported(text: str, sentence: str, tmp_path: Path) -> None:
+def test_each_mistake_in_the_settings_for_pc_tools_is_reported(
+    text: str, sentence: str, tmp_path: Path
+) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(f"[serve.tool]\n{text}\n" + LINES)
     with pytest.raises(PlantError) as wrong:

@@ -76,7 +76,6 @@ def sent(draw: st.DrawFn) -> tuple[NumberFormat, str, float, float, bytes]:
 @example((NumberFormat.F32, "ABCD", 1, 0, b"\0\0\0\x01"))  # the smallest positive float
 @example((NumberFormat.U64, "ABCD", 1, 0, (2**53 + 1).to_bytes(8)))  # not representable as float64
 @example((NumberFormat.U64, "ABCD", 0.1, 0, (2**53 + 1).to_bytes(8)))
-# its raw count is not representable either
 @example((NumberFormat.U64, "ABCD", 60, 0, (2**53 + 1).to_bytes(8)))
 @example((NumberFormat.I64, "ABCD", 1, 0, (-(2**53) - 1).to_bytes(8, signed=True)))
 @example((NumberFormat.F64, "ABCD", 0.1, 0, struct.pack(">d", 0.30000000000000004)))
@@ -146,7 +145,7 @@ def test_no_register_words_are_computed_for_a_format_with_undefined_bits(details
     assert exact_data(declared(**details), 5.0) is None
 
 
-def test_register_words_are_unknown_if_another_register_has_the_scale() -> None:
+def test_the_words_of_a_register_scaled_by_another_one_are_not_computed() -> None:
     family = type(
         "Scaled",
         (Drive,),
@@ -245,7 +244,8 @@ def test_a_modbus_client_gets_no_value_polled_before_a_write() -> None:
     assert read(3, 1, 1, since_ns=NOW + 1) is Unavailable.STALE
 
 
-def test_the_newest_of_two_values_at_the_same_address_is_used() -> None:
+def test_the_newest_value_is_used_if_two_registers_have_one_address() -> None:
+    # address 0 has the registers `speed`, polled half a second ago, and `again`, polled a second ago
     assert read(3, 0, 1, again=FakeRow(NOW, 14.49)) == [1449]
     assert read(3, 0, 1, speed=FakeRow(NOW, None)) == [1450]
 

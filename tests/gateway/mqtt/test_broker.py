@@ -441,7 +441,7 @@ def test_nats_reports_a_lost_gateway(broker: RunningBroker, listener: Listener, 
 
 @pytest.mark.slow
 @on_nats
-def test_only_a_stop_over_nats_may_be_delayed_or_repeated(
+def test_a_write_over_nats_is_refused_if_it_is_late_or_repeated(
     broker: RunningBroker, listener: Listener, start: Start
 ) -> None:
     def told() -> Any:

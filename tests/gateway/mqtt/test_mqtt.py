@@ -433,7 +433,7 @@ def test_an_infinite_value_is_published_as_null(listener: Listener, start: Start
     assert b'"output_frequency": null' in said.payload
 
 
-def test_without_commands_the_only_command_topic_is_that_of_the_sparkplug_node(tmp_path: Path) -> None:
+def test_the_gateway_subscribes_to_no_drive_commands_unless_they_are_enabled(tmp_path: Path) -> None:
     require_module("paho.mqtt.client")
     part: Any = build(MqttSettings(sparkplug="works", node="line"), inside(tmp_path))
     assert [messages.topics() for messages in part._formats] == [
@@ -482,7 +482,9 @@ def test_home_assistant_discovers_each_drive(broker: Broker, listener: Listener,
     assert parts["setpoint_set"]["command_topic"] == "multidrop/pump-1/set/setpoint"
 
 
-def test_the_home_assistant_template_can_write(broker: Broker, listener: Listener, start: Start) -> None:
+def test_a_write_made_from_the_home_assistant_template_is_carried_out(
+    broker: Broker, listener: Listener, start: Start
+) -> None:
     known, _ = start(home_assistant=True, commands=True)
     said = listener.wait_for(has("homeassistant/device/multidrop-pump-1/config"))
     part = json_of(said)["cmps"]["setpoint_set"]
@@ -708,14 +710,14 @@ def test_reserved_topics_in_the_mqtt_settings_are_refused(topics: dict[str, str]
         MqttSettings(**topics)
 
 
-def test_a_plant_file_name_that_cannot_be_an_edge_node_is_reported(tmp_path: Path) -> None:
+def test_a_plant_file_name_that_sparkplug_forbids_is_reported(tmp_path: Path) -> None:
     plant = replace(inside(tmp_path).plant, path=tmp_path / "a+b.toml")
     assert MqttSettings().check(plant) == MqttSettings(sparkplug="works", node="hall").check(plant) == []
     (sentence,) = MqttSettings(sparkplug="works").check(plant)
     assert sentence == "the plant file's name 'a+b' cannot be an edge node; add node = \"hall-1\""
 
 
-def test_drives_cannot_have_the_fixed_words_of_topics_as_names(tmp_path: Path) -> None:
+def test_words_of_mqtt_topics_are_reserved_as_drive_names(tmp_path: Path) -> None:
     topics = JsonTopics(MqttSettings(commands=True), inside(tmp_path), now_ms)
     topics.outbox = PutMessages()
     topics.connected()

@@ -159,7 +159,8 @@ def test_a_new_connection_has_the_next_bdseq(host: Host, node: tuple[Any, Runnin
     host.wait_for("DBIRTH", "pump-1")
 
 
-def test_only_the_last_pending_birth_or_death_certificate_of_a_drive_is_sent(tmp_path: Path) -> None:
+def test_only_the_newest_pending_certificate_of_a_drive_is_sent(tmp_path: Path) -> None:
+    """In Sparkplug, a birth or death certificate says whether a drive is online."""
     known, sent, is_open = inside(tmp_path), [], [True]
 
     def send(message: Publication) -> int | None:

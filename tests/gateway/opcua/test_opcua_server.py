@@ -287,7 +287,7 @@ address = 1
 
 
 @pytest.mark.slow
-def test_a_stop_of_all_drives_is_sent_although_many_wait_for_a_silent_drive(tmp_path: Path) -> None:
+def test_a_stop_of_all_drives_is_sent_while_many_earlier_stops_wait(tmp_path: Path) -> None:
     silent, port = os.openpty()
     try:
         with (

@@ -54,7 +54,7 @@ class FakeGateway:
         self.has_no_alarm = False  # True: an acknowledgement is answered with "there is no such alarm"
         # successive answers about parameters; the last is repeated
         self.parameters: list[dict[str, Any]] = []
-        self.fleet: dict[str, Any] = {}  # keys of /api/fleet to replace
+        self.fleet: dict[str, Any] = {}  # changed keys of the answer to /api/fleet
         self.fleet_outcomes: dict[str, dict[str, Any]] = {}  # answer to a stop of the fleet
         self.reloaded: dict[str, Any] = {
             "done": True,
@@ -62,8 +62,8 @@ class FakeGateway:
             "mistakes": [],
             "restart": [],
         }
-        self.is_silent = False  # True: requests for messages to the page get no answer
-        self.stands_still = False  # True: no further messages to the page are made
+        self.is_silent = False  # True: the page's requests for new values get no answer
+        self.stands_still = False  # True: there are no new values
         self.began = time.time()
         self.outcomes: dict[str, dict[str, Any]] = {}
         self._lock = threading.Lock()

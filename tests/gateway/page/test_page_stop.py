@@ -140,7 +140,9 @@ def test_stop_all_works_while_another_dialog_is_open(opened: Opener, gateway: Fa
     assert gateway.posts == [("/api/stop", {"drives": None})]
 
 
-def test_a_stops_result_does_not_replace_another_stops_question(opened: Opener, gateway: FakeGateway) -> None:
+def test_the_result_of_one_stop_does_not_replace_the_question_of_another(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     """The result of the stop of one drive arrives while the question of Stop all is open."""
     page = opened("#/drives/pump-1")
     gateway.is_held = threading.Event()
@@ -158,7 +160,7 @@ def test_a_stops_result_does_not_replace_another_stops_question(opened: Opener, 
     assert [body for _, body in gateway.posts] == [{"drives": ["pump-1"]}, {"drives": None}]
 
 
-def test_stop_all_works_if_another_script_fails_to_load(opened: Opener, gateway: FakeGateway) -> None:
+def test_the_stop_all_button_works_if_a_view_fails_to_load(opened: Opener, gateway: FakeGateway) -> None:
     """If one view cannot be loaded, no view is shown, but stops work."""
     broken = ("**/page/views/drives/table.js", "**/page/vendor/*", "**/api/frame*")
     page = opened(live=False, prepare=aborting(*broken))
@@ -260,7 +262,7 @@ def test_typing_a_token_slowly_shows_no_warning(opened: Opener, gateway: FakeGat
     told(page, "All 10 drives are stopped")
 
 
-def test_a_stop_without_the_right_asks_for_a_token(opened: Opener, gateway: FakeGateway) -> None:
+def test_a_stop_asks_for_a_token_if_the_gateway_requires_one(opened: Opener, gateway: FakeGateway) -> None:
     gateway.token = "right"
     page = opened()
     page.locator("#stopall").click()
@@ -291,10 +293,10 @@ SECOND_CLICK = """([x, y]) => document.querySelector('#ask form button:not(.calm
         ("#/drives/pump-1", "button:text-is('start')", "start pump-1", []),
     ],
 )
-def test_a_double_click_confirms_a_sign_in_only_if_it_is_for_a_stop(
+def test_a_double_click_submits_the_sign_in_form_only_for_a_stop(
     opened: Opener, gateway: FakeGateway, view: str, asks: str, confirms: str, sent: list[Any]
 ) -> None:
-    """A password manager may fill in the token immediately."""
+    """The form opens after the first click, and a password manager may fill in the token immediately."""
     gateway.token = "right"
     page = opened(view)
     page.locator(asks).click()
@@ -309,7 +311,9 @@ def test_a_double_click_confirms_a_sign_in_only_if_it_is_for_a_stop(
     assert gateway.posts == sent
 
 
-def test_a_refused_stop_is_shown_as_not_sent(opened: Opener, gateway: FakeGateway) -> None:
+def test_a_stop_is_shown_as_not_sent_if_the_sign_in_is_cancelled(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     gateway.token = "right"
     page = opened()
     page.locator("#stopall").click()
@@ -421,7 +425,9 @@ def test_the_stop_key_works_behind_a_dialog_but_not_in_a_text_field(opened: Open
 
 
 @pytest.mark.parametrize("verb", ["stop", "emergency stop"])
-def test_the_page_waits_longer_than_a_stop_repeats(opened: Opener, gateway: FakeGateway, verb: str) -> None:
+def test_the_page_waits_longer_than_the_gateway_repeats_a_stop(
+    opened: Opener, gateway: FakeGateway, verb: str
+) -> None:
     """With one dead drive, the page could otherwise never show which drives have stopped."""
     page = opened("#/drives/pump-1")
     page.evaluate("""() => {

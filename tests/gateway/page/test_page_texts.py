@@ -216,11 +216,11 @@ def test_each_text_has_all_languages_with_the_same_placeholders() -> None:
             assert text.strip() == text != "", (english, language)
 
 
-def test_each_fixed_word_of_the_gateway_is_in_the_catalogue() -> None:
+def test_each_fixed_text_of_the_gateway_has_a_translation() -> None:
     assert GATEWAY_WORDS - TEXTS.keys() == set()
 
 
-def test_the_catalogue_has_no_unused_text() -> None:
+def test_the_translations_contain_no_unused_text() -> None:
     assert OWN_PART.keys() - PAGE_TEXTS == set()
     sources = "".join(
         path.read_text("utf-8")
@@ -296,7 +296,9 @@ def english_in(texts: list[str]) -> set[str]:
 
 @pytest.mark.long
 @pytest.mark.parametrize("language", ["ru", "zh"])
-def test_each_view_fits_a_narrow_screen_without_english_text(opened: Opener, axe: str, language: str) -> None:
+def test_each_translated_view_fits_a_narrow_screen_and_has_no_english_text(
+    opened: Opener, axe: str, language: str
+) -> None:
     page = opened(live=False, locale=language)
     page.set_viewport_size(NARROW)
     until(page, f"document.querySelector('#link').textContent === '{LIVE[language]}'")
@@ -351,7 +353,9 @@ def test_the_language_chosen_on_the_page_has_precedence_and_is_kept(opened: Open
 
 
 @pytest.mark.long
-def test_register_titles_are_in_the_language_of_the_answer(opened: Opener, gateway: FakeGateway) -> None:
+def test_the_page_shows_the_register_titles_that_the_gateway_sends(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     first = fake_plant.plant({})["lines"][0]
     titled = [one | {"title": f"«{one['name']}»"} for one in first["drives"][0]["registers"]]
     gateway.plant_changes = {"lines": [first | {"drives": [first["drives"][0] | {"registers": titled}]}]}

@@ -143,7 +143,7 @@ def resize(page: Any, width: int, height: int) -> None:
     page.set_viewport_size({"width": width, "height": height})
 
 
-def test_the_unit_raw_count_stays_within_its_table_column(opened: Opener, gateway: FakeGateway) -> None:
+def test_a_long_unit_stays_within_its_table_column(opened: Opener, gateway: FakeGateway) -> None:
     line = fake_plant.plant({})["lines"][0]
     raw = [
         r | {"unit": "raw count", "digits": 3} if r["unit"] == "A" else r
@@ -169,7 +169,7 @@ def test_words_about_a_drives_state_are_not_cut_off(opened: Opener) -> None:
 
     def is_whole() -> bool:
         too_wide, height = words.evaluate_all(parts)
-        # height of two lines in px, so no word is broken
+        # The text has at most the height of two lines (px). With a broken word it would need three lines.
         return bool(too_wide <= 0 and height <= 2 * 14 * 1.2 + 1)
 
     for size in ((1440, 900), (768, 1024), (390, 844)):
@@ -416,7 +416,7 @@ def test_on_a_phone_several_drives_can_be_plotted_with_different_line_styles(ope
     plot = page.locator("#trend-plots .plotbox").first
     before = plot.bounding_box()
     plot.hover(position={"x": 200, "y": 40})
-    until_met(page, lambda: ":" in heads.first.inner_text())  # shows the time at the cursor
+    until_met(page, lambda: ":" in heads.first.inner_text())  # time at the cursor, in the plot's legend
     assert plot.bounding_box() == before
 
 
@@ -580,7 +580,8 @@ def test_the_page_without_a_history_shows_a_message_and_works(opened: Opener, ga
     page.locator("#past-note").get_by_text("No history is kept").wait_for()
     page.get_by_role("button", name="1 min").click()
     until(page, "document.querySelector('#past-note').hidden")
-    assert [url for url in asked if "api/history" in url] == []  # the browser would show a 404 as an error
+    # The page must not request the history: the browser would log the answer 404 as an error.
+    assert [url for url in asked if "api/history" in url] == []
 
 
 def test_active_and_ended_faults_are_listed_separately(opened: Opener) -> None:
@@ -614,7 +615,7 @@ def test_the_view_of_lines_shows_utilisation_failed_reads_and_delays(opened: Ope
     assert "3 of 5120" in line.locator("tr", has_text="labeller").inner_text()
 
 
-def test_the_view_of_the_log_shows_callers_writes_and_results(opened: Opener) -> None:
+def test_the_log_view_shows_each_write_with_its_sender_and_result(opened: Opener) -> None:
     page = opened("#/log")
     rows = page.locator("#log-list tbody tr")
     rows.first.wait_for()

@@ -77,7 +77,9 @@ def test_figures_of_a_lost_gateway_look_old(opened: Opener, gateway: FakeGateway
     assert "counted yet" not in page.locator("#lines").inner_text()
 
 
-def test_fault_durations_are_right_before_the_first_values(opened: Opener, gateway: FakeGateway) -> None:
+def test_fault_durations_are_correct_although_no_values_have_arrived_yet(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     gateway.is_silent = True
     page = opened("#/faults", live=False)
     lasted = page.locator("#faults td").get_by_text("so far").nth(1)
@@ -120,7 +122,9 @@ def test_a_plant_with_one_drive_is_described_in_the_singular(opened: Opener, gat
     page.get_by_text(re.compile("· 1 drive$")).wait_for()
 
 
-def test_the_alarm_strip_has_the_colour_of_a_hidden_fault(opened: Opener, gateway: FakeGateway) -> None:
+def test_the_alarm_strip_has_the_colour_of_a_fault_that_does_not_fit(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     now = fake_plant.ms(time.time())
     silent, fault = ({"text": "no reply", "kind": "silent"}, {"text": "undervoltage", "kind": "fault"})
     kinds = zip(("labeller", "screw", "booster-1"), (silent, silent, fault), strict=True)
@@ -230,7 +234,9 @@ def strip(page: Any) -> list[str]:
     return [text.split(":")[0] for text in found]
 
 
-def test_the_most_serious_alarm_is_listed_first(opened: Opener, alarmed: FakeGateway) -> None:
+def test_alarms_are_listed_by_severity_and_acknowledged_ones_last(
+    opened: Opener, alarmed: FakeGateway
+) -> None:
     page = opened("#/faults")
     wanted = ["conveyor-2", "pump-4", "line hall-4", "labeller", "booster-1"]
     assert strip(page) == wanted

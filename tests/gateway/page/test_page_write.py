@@ -23,7 +23,7 @@ CONFIRMED_AT = """([x, y]) => new MutationObserver(() => {
 }).observe(document.querySelector('#ask'), { childList: true })"""
 
 
-def test_a_write_is_confirmed_by_name_and_sent_once(opened: Opener, gateway: FakeGateway) -> None:
+def test_a_write_is_sent_once_if_the_user_double_clicks(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/drives/pump-1")
     # the plant file allows writes to one register
     assert page.get_by_role("button", name="Change").count() == 1
@@ -202,9 +202,7 @@ def test_early_keys_confirm_no_dialog(opened: Opener, gateway: FakeGateway, key:
     assert gateway.posts == [("/api/act", {"drive": "pump-1", "verb": "start", "options": {}})]
 
 
-def test_a_command_has_the_number_of_the_message_shown_at_its_confirmation(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_a_confirmed_command_contains_the_newest_message_number(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/drives/pump-1")
     newest = "import('/page/data/store.js').then(m => m.store.frame.n)"
     page.get_by_role("button", name="start").click()
@@ -347,7 +345,9 @@ def test_reload_by_keyboard_shows_mistakes(opened: Opener, gateway: FakeGateway)
     assert gateway.posts == [("/api/reload", {"confirm": True})]
 
 
-def test_reload_needs_a_plant_file_and_the_right(opened: Opener, gateway: FakeGateway) -> None:
+def test_the_page_offers_no_reload_without_a_plant_file_or_write_role(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     for changed in ({"file": False}, {"may": {"role": "stop", "write": [], "verbs": []}}):
         gateway.plant_changes = changed
         page = opened()

@@ -44,7 +44,8 @@ RUN_AXE = """([tags, without]) => axe.run(document, {
 }).then(found => found.violations)"""
 
 
-# The page polls by itself, which costs less than messages. Its CSP forbids `page.wait_for_function`.
+# JavaScript that evaluates an expression again and again until it is true. This costs less than calls from
+# Python. The page's content security policy forbids Playwright's own `page.wait_for_function`.
 POLLED = """new Promise((done, fail) => {
   let left = %(looks)d;
   const look = async () => {

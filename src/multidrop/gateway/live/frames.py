@@ -22,7 +22,7 @@ from multidrop.gateway.live.alarms import LOST, Alarms
 from multidrop.gateway.live.hub import Hub, KeptRow
 from multidrop.gateway.live.recent_statistics import RecentStatistics
 
-LEAST_S = 0.2  # shortest mean time, in s, between two messages to the page
+LEAST_S = 0.2  # shortest mean time, in s, between two frames
 EARLY_S = 0.02  # in s: after a late message, the next one may be early by at most this time
 WAIT_S = 20.0  # longest wait, in s, of a request for a new message
 MOST_VIEWERS = 200  # limit of concurrently waiting viewers
@@ -73,7 +73,7 @@ def frame_of(
 
 
 def _drive(hub: Hub, name: str, time_ns: int) -> dict[str, Any]:
-    """Return a drive's entry in a message to the page.
+    """Return a drive's entry in a frame, the message with the plant's state.
 
     A fresh value is a pair: the value, and the index of its age in the message's list `ages_ms`.
     """
@@ -166,7 +166,7 @@ def changes(before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
 
 
 class Frames:
-    """The newest messages to the page, and the viewers that wait for the next one.
+    """The newest frames (messages with the plant's state), and the viewers that wait for the next one.
 
     `clock` returns monotonic seconds. Message numbers start at `begin`, which must be random, so that a
     message of an earlier process is never mistaken for one of this process.
@@ -194,7 +194,7 @@ class Frames:
         return len(self._waiting)
 
     def note_news(self) -> None:
-        """Note that the plant's state has changed since the newest message to the page."""
+        """Note that the plant's state has changed since the newest frame was made."""
         self._has_news = True
         self._build_when_due()
 
