@@ -53,7 +53,7 @@ def drawn(told: dict[str, Any], width: int = 120, height: int = 40) -> str:
     return "\n".join(one.plain for one in lines)
 
 
-def test_the_screen_shows_gateways_lines_and_moves() -> None:
+def test_the_screen_shows_gateways_lines_and_changes_of_masters() -> None:
     text = drawn(told())
     assert re.search(r"gw-1 +pc-1 +3 +1970-01-01 00:00:00 +working +6 +1\.9 s +81 kB +2 +1\.5 s +0\n", text)
     assert re.search(r"gw-2 +pc-1 .*no answer +6 +- +- +- +- +-\n", text)
@@ -103,7 +103,7 @@ def test_a_narrow_terminal_drops_less_important_columns() -> None:
     ]
 
 
-def test_a_narrow_terminal_still_shows_masters_and_the_last_moves() -> None:
+def test_a_narrow_terminal_still_shows_masters_and_their_last_changes() -> None:
     shown = drawn(told(), 40).splitlines()
     assert [re.sub(" +", " ", row) for row in shown if re.match("LINE|line-1 ", row)] == [
         "LINE MASTER SINCE",
@@ -197,7 +197,7 @@ def test_control_characters_in_a_hosts_name_are_not_printed() -> None:
     assert "\x1b" not in drawn(found)
 
 
-def test_moves_without_a_known_former_master_are_shown() -> None:
+def test_changes_of_masters_without_a_known_former_master_are_shown() -> None:
     moves = [MOVE | {"from": None}, MOVE | {"from": ""}, MOVE | {"to": ""}]
     assert [re.sub(" +", " ", row)[27:] for row in move_table(moves)] == [
         "to gw-2",

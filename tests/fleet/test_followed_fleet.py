@@ -437,7 +437,7 @@ def test_a_gateway_that_does_not_answer_is_shown_without_a_state() -> None:
 
 
 @table("moves", [[{}], [5], "text", None, [MOVE | {"at_ms": "now"}]])
-def test_an_invalid_list_of_moved_lines_in_an_answer_is_ignored(moves: Any) -> None:
+def test_an_invalid_list_of_changed_masters_in_an_answer_is_ignored(moves: Any) -> None:
     found = looked(view({"gw-1": STATE | {"last_moves": moves}}))
     assert found["gateways"]["gw-1"]["says"] == STATE
 

@@ -222,7 +222,7 @@ def test_a_command_is_carried_out_once_although_its_confirmation_is_repeated(
     tell(story)
 
 
-def test_a_gateway_rejects_the_confirmation_of_another_gateways_offer(tell: Callable[[Story], None]) -> None:
+def test_a_gateway_rejects_a_confirmation_meant_for_another_gateway(tell: Callable[[Story], None]) -> None:
     async def story(fleet: Fleet) -> None:
         await fleet.one.open()
         offered = await fleet.offered()

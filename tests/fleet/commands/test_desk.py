@@ -82,7 +82,7 @@ async def test_a_command_that_is_confirmed_several_times_is_sent_once(desk: Desk
     assert setpoints(desk) == [2000]
 
 
-def test_copies_of_a_command_request_get_the_same_offer(desk: Desks) -> None:
+def test_copies_of_a_command_request_get_the_same_token(desk: Desks) -> None:
     same = {"id": "one", "register": SETPOINT, "value": 20.0}
     assert desk.offered(**same) == desk.offered(**same)
     assert desk.offered(**same) != desk.offered(**(same | {"id": "two"}))
@@ -95,7 +95,7 @@ async def test_a_late_confirmation_sends_nothing(desk: Desks, late_s: float, out
     answer = await desk.do(token)
     assert answer.outcome is outcome
     assert len(setpoints(desk)) == (outcome is DONE)
-    assert ("s have passed since the offer" in answer.text) == (outcome is NOT_SENT)
+    assert ("s have passed since it was checked" in answer.text) == (outcome is NOT_SENT)
 
 
 async def do_after(desk: Desks, deed: Callable[[], object], waited_s: float = 0.0) -> CommandAnswer:
@@ -194,7 +194,9 @@ async def test_a_stop_of_another_drive_does_not_cancel_a_command(desk: Desks) ->
     assert (await desk.do(token)).outcome is DONE
 
 
-async def test_a_restarted_gateway_rejects_confirmations_of_old_offers(desk: Desks, tmp_path: Path) -> None:
+async def test_a_restarted_gateway_rejects_confirmations_of_earlier_commands(
+    desk: Desks, tmp_path: Path
+) -> None:
     token = desk.offered()
     with desks(tmp_path) as after:
         assert (await after.do(token)).outcome is UNKNOWN

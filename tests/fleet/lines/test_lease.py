@@ -376,7 +376,9 @@ async def test_a_starting_session_replaces_no_record_of_a_living_session() -> No
     assert not second.is_valid
 
 
-async def test_a_released_lock_proves_a_process_dead(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_released_lock_file_proves_that_a_process_died(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(leases, "machine_id", lambda: "this machine")
     trial = Trial()
     lock = LifeLock(tmp_path / "a.lock")

@@ -193,7 +193,9 @@ class Ports:
 
 @pytest.mark.slow
 @pytest.mark.long
-async def test_lines_move_if_they_cannot_be_opened(fleet: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_line_goes_to_another_gateway_if_its_port_cannot_be_opened(
+    fleet: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A gateway is cut off from its lines but not from the servers, so its lease stays valid."""
     monkeypatch.setattr(shares, "LOST_NS", SECOND // 2)
     # longer than a failed attempt to open a line again, which takes up to 2 s
@@ -221,7 +223,7 @@ async def test_lines_move_if_they_cannot_be_opened(fleet: Cluster, monkeypatch: 
 
 @pytest.mark.slow
 @pytest.mark.long
-async def test_a_drained_gateway_releases_all_lines_and_claims_none(fleet: Cluster) -> None:
+async def test_a_gateway_gives_up_all_lines_after_fleet_drain(fleet: Cluster) -> None:
     async with gateways(fleet, "a", "b", "c", terms=LONG) as running:
         drained = running.members["c"]
         drained.drain()
@@ -286,7 +288,9 @@ async def test_lines_are_added_changed_and_removed_with_the_plant(fleet: Cluster
 
 @pytest.mark.slow
 @pytest.mark.long
-async def test_an_incompatible_gateway_blocks_claims(fleet: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_no_line_gets_a_new_master_beside_an_incompatible_gateway(
+    fleet: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The incompatible gateway is alive at the start of this gateway, or joins the fleet later."""
     async with gateways(fleet, terms=LONG) as running, other_version(fleet, monkeypatch) as other:
         await other.begin()
@@ -311,7 +315,7 @@ async def test_an_incompatible_gateway_blocks_claims(fleet: Cluster, monkeypatch
 
 @pytest.mark.slow
 @pytest.mark.long
-async def test_no_line_moves_when_a_server_dies(fleet: Cluster) -> None:
+async def test_no_line_changes_its_master_when_a_server_dies(fleet: Cluster) -> None:
     """Two of three lease records are renewed as before. The third waits 4 to 9 s for another leader."""
     async with gateways(fleet, "a", "b", terms=LONG) as running:
         member = running.members["a"]

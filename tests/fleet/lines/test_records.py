@@ -161,7 +161,7 @@ def test_a_line_with_one_record_for_each_of_two_gateways_is_listed_for_both() ->
     assert records.owned_by("b", 1) == set()
 
 
-def test_a_move_has_no_former_master_if_earlier_records_were_not_read() -> None:
+def test_the_former_master_is_unknown_if_earlier_records_were_not_read() -> None:
     """Gateways have claimed the line in the meantime, and this gateway has not read their records."""
     records = followed()
     take(records, 8, owner_value(("b", 1), 8, 0), FIRST_BUCKET, SECOND_BUCKET)
@@ -173,7 +173,7 @@ def test_a_move_has_no_former_master_if_earlier_records_were_not_read() -> None:
     assert moves_of(records)[0] == ("a", "")
 
 
-def test_a_line_claimed_again_by_its_master_is_not_reported_as_moved() -> None:
+def test_a_line_that_its_master_claims_again_has_not_changed_masters() -> None:
     """The master claims its own line again because the outcome of the line's release was unknown."""
     records = followed()
     take(records, 1, owner_value(("a", 2), 1, 0), FIRST_BUCKET, SECOND_BUCKET)

@@ -42,7 +42,7 @@ def test_no_gateway_has_more_than_110_percent_of_the_mean() -> None:
     assert min(shares.values()) >= 25
 
 
-def test_few_lines_move_when_a_gateway_joins_or_leaves() -> None:
+def test_few_lines_change_gateways_when_a_gateway_joins_or_leaves() -> None:
     all_of_them = assign(LINES, GATEWAYS)
     without = assign(LINES, GATEWAYS[1:])
     must = sum(gateway == GATEWAYS[0] for gateway in all_of_them.values())
@@ -159,7 +159,7 @@ def reported(*lines: str) -> tuple[HandClock, UnopenedLines]:
     return clock, unopened
 
 
-def test_a_line_is_reported_as_unopened_after_three_failures() -> None:
+def test_a_port_that_fails_to_open_three_times_is_reported() -> None:
     unopened = UnopenedLines(HandClock())
     for _ in range(OPENINGS - 1):
         unopened.failed("a")
@@ -209,7 +209,7 @@ def test_a_line_with_a_lost_port_is_reported_after_6_s(silent_s: float | None, n
     assert lost_after(0.1)
 
 
-def test_unopened_lines_are_tried_one_after_another_with_increasing_pauses() -> None:
+def test_closed_ports_are_retried_one_after_another_with_increasing_pauses() -> None:
     clock, unopened = reported(*"abc")
     wait_s = FIRST_WAIT_NS / SECOND
     for line in "abcab":
@@ -234,7 +234,7 @@ def test_a_line_that_no_gateway_can_open_is_retried_first() -> None:
     assert unopened.named() == {"a", "b", "c"}
 
 
-def test_the_other_unopened_lines_are_tried_immediately_after_one_was_opened() -> None:
+def test_all_reported_lines_are_retried_as_soon_as_one_was_opened() -> None:
     clock, unopened = reported(*"abc")
     clock.pass_s(FIRST_WAIT_NS / SECOND)
     for line, left in (("a", {"b", "c"}), ("b", {"c"}), ("c", set[str]())):
@@ -280,16 +280,16 @@ def test_all_gateways_reassign_exactly_the_lines_that_cannot_be_opened() -> None
     assert found == hand_over(dict(reversed(SHARED.items())), {"c": [], "b": [], "a": sorted(OF_A)})
 
 
-def test_a_line_that_no_gateway_can_open_is_not_moved() -> None:
+def test_a_line_that_no_gateway_can_open_stays_with_its_gateway() -> None:
     assert hand_over(SHARED, {"a": SIXTY, "b": SIXTY, "c": SIXTY}) == SHARED
 
 
-def test_an_unopened_line_moves_to_a_gateway_that_can_open_it() -> None:
+def test_a_line_is_assigned_to_a_gateway_that_can_open_its_port() -> None:
     found = hand_over(SHARED, {"a": OF_A, "b": OF_A, "c": []})
     assert {found[line] for line in OF_A} == {"c"}
 
 
-def test_a_gateway_that_sends_no_list_of_unopened_lines_takes_none_from_others() -> None:
+def test_a_gateway_that_reports_no_list_of_failed_lines_gets_no_others() -> None:
     """A gateway of another version reports no list, and would not take lines that others could not open."""
     assert hand_over(SHARED, {"a": OF_A}) == SHARED
     assert set(hand_over(SHARED, {"a": OF_A, "c": []}).values()) == {"b", "c"}

@@ -417,7 +417,7 @@ def test_samples_in_postgresql_have_their_units(empty: Postgres) -> None:
 
 
 @pytest.mark.slow
-def test_a_second_hub_of_a_database_waits_until_the_first_ends(empty: Postgres) -> None:
+def test_a_second_hub_waits_until_the_first_one_has_left_the_database(empty: Postgres) -> None:
     one, other = PostgresSink(empty.where), PostgresSink(empty.where)
     assert one.begin("then") == StoredPosition(0, {})
     with pytest.raises(SinkError, match="another hub writes into this database; waiting until it ends"):

@@ -288,7 +288,9 @@ def servers(monkeypatch: pytest.MonkeyPatch) -> Servers:
 
 
 @pytest.mark.parametrize("lagging", [set(), {"n3"}])
-async def test_no_bucket_is_handed_over_without_a_silent_server(servers: Servers, lagging: set[str]) -> None:
+async def test_no_bucket_changes_its_leader_while_all_servers_answer(
+    servers: Servers, lagging: set[str]
+) -> None:
     servers.lagging = lagging  # their copies of the buckets lag behind
     await servers.pass_s(100)
     assert set(servers.terms.values()) == {1}
@@ -336,20 +338,20 @@ async def test_a_server_that_stays_silent_is_ignored_until_it_returns(servers: S
     assert all(servers.terms[bucket] > before[bucket] for bucket in names.LEASES)
 
 
-async def test_no_other_bucket_is_handed_over_after_a_failed_hand_over(servers: Servers) -> None:
+async def test_no_further_bucket_changes_its_leader_after_a_failed_change(servers: Servers) -> None:
     servers.silent, servers.stuck = {"n3"}, set(names.LEASES)
     servers.leaders[names.LEASES[2]] = "n1"
     await servers.pass_s(1)
     assert sorted(servers.terms.values()) == [1, 1, 2]
 
 
-async def test_a_single_remaining_server_hands_no_bucket_over(servers: Servers) -> None:
+async def test_a_single_remaining_server_stays_the_leader_of_its_buckets(servers: Servers) -> None:
     servers.silent = {"n2", "n3"}
     await servers.pass_s(10)
     assert set(servers.terms.values()) == {1}
 
 
-async def test_a_leader_that_does_not_answer_delays_no_hand_over_of_other_buckets(servers: Servers) -> None:
+async def test_a_leader_without_answers_delays_no_change_of_other_buckets_leaders(servers: Servers) -> None:
     servers.silent = {"n2"}
     begun = asyncio.get_running_loop().time()
     clusters = await led_clusters(PATH)
@@ -373,8 +375,8 @@ async def test_raft_terms_rise_before_a_cut_off_server_starts_an_election(
     keeping.cancel()
 
 
-async def test_the_leadership_of_each_bucket_returns_to_its_home_server(servers: Servers) -> None:
-    """Another server may lead a bucket, such as after a hand-over because of a silent server."""
+async def test_each_bucket_gets_back_the_leader_that_it_should_have(servers: Servers) -> None:
+    """Another server may lead a bucket, such as after a time in which a server was silent."""
     servers.leaders |= {"lease_0": "n2", "own_2": "n1"}
     servers.lagging = {"n1"}
     assert await bring_leaders_home(PATH, await led_clusters(PATH)) == 1

@@ -267,7 +267,7 @@ async def _check(fleet: Cluster) -> None:
 
 
 @pytest.mark.long
-async def test_a_connection_moves_to_another_server_and_returns_home(tmp_path: Path) -> None:
+async def test_a_connection_uses_another_server_until_its_own_one_answers_again(tmp_path: Path) -> None:
     with cluster(tmp_path, 3) as three:
         path = paths_of(three.urls)[1]
         await path.open()
@@ -287,7 +287,7 @@ async def test_a_connection_moves_to_another_server_and_returns_home(tmp_path: P
 
 
 @pytest.mark.long
-async def test_a_connection_whose_home_server_is_silent_uses_another_server(tmp_path: Path) -> None:
+async def test_a_connection_whose_own_server_is_silent_uses_another_one(tmp_path: Path) -> None:
     with cluster(tmp_path, 2) as two:
         two.nodes[0].pause()
 

@@ -126,11 +126,11 @@ async def _print_lines(arguments: argparse.Namespace, paths: list[ServerPath]) -
 
 OLD_S = 3.0  # an older state of the fleet is shown dimmed
 NOTES = 4  # limit of the rows for notes, and of the rows for problems
-MOVES = 8  # limit of the rows that show how lines moved between gateways, if the lines fill the screen
+MOVES = 8  # limit of the rows that show changes of masters, if the lines fill the screen
 
 
 def picture(fleet: FleetState, size: tuple[int, int], head: str) -> list[TextLine]:
-    """Draw a fleet's gateways and lines, the lines' moves between gateways, and notes.
+    """Draw a fleet's gateways and lines, the latest changes of masters, and notes.
 
     `fleet` has the form that `fleet watch --json` prints, plus the key "notes": a list of sentences.
     """

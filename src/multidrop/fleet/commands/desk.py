@@ -5,8 +5,8 @@ offer with a token. If the sender returns the token within a second, measured by
 CLOCK_BOOTTIME, the desk carries out the command. The command is recorded on the disk before it is sent, and
 again when it has ended.
 
-A stop needs no offer and no entry in `[fleet.may]`: sending a stop twice is harmless, but a late stop may do
-harm. The stop is sent first and recorded afterwards.
+A stop needs no confirmation and no entry in `[fleet.may]`: sending a stop twice is harmless, but a late stop
+may do harm. The stop is sent first and recorded afterwards.
 
 A gateway subscribes to a line's subjects only while it polls the line. For a line without a master, the
 server therefore reports to a sender that its message has no receiver. A gateway is connected to several
@@ -108,8 +108,8 @@ class CommandDesk:
     async def do(self, data: bytes) -> CommandAnswer:
         """Carry out an offered command once and return its result.
 
-        A message with `ask` instead of `do` only requests the result. If no `do` came before, the offer is
-        withdrawn and the answer is "not sent".
+        A message with `ask` instead of `do` only requests the result. If no `do` came before, the command is
+        cancelled and the answer is "not sent".
         """
         try:
             message = read_json(data)
@@ -170,7 +170,7 @@ class CommandDesk:
         return answer
 
     def _limit_ns(self, offer: Offer) -> float:
-        """Return the deadline for sending the command (CLOCK_MONOTONIC, ns); 0 if its offer was cancelled."""
+        """Return the deadline for sending the command (CLOCK_MONOTONIC, ns); 0 if it was cancelled."""
         # read before CLOCK_BOOTTIME, because a pause between the two reads must not make the deadline later
         now_ns = time.monotonic_ns()
         return 0 if offer.why_void else now_ns + self.offers.left_ns(offer)

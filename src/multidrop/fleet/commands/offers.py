@@ -23,7 +23,7 @@ from multidrop.fleet.commands.messages import CommandAnswer, CommandRequest
 from multidrop.fleet.lines.rules import SECOND
 
 LIMIT_NS = 1 * SECOND  # time limit from the check of a command until its first frame is sent
-REMEMBERED = 10_000  # limit of remembered offers; the oldest are forgotten
+REMEMBERED = 10_000  # limit of remembered commands; the oldest are forgotten
 LISTS = ("write", "verbs")  # the two lists in the plant file's table [fleet.may]
 _MOVING = ("start", "jog", "reset_fault", "set_frequency")
 
@@ -193,7 +193,7 @@ class Offers:
         return len(self._by_token)
 
     def make(self, request: CommandRequest, prepared: Prepared, held: HeldLine) -> Offer:
-        """Return an offer for a checked request. A copy of a request gets the same offer."""
+        """Return the offer of a checked command. A copy of a command's message gets the same offer."""
         known = self._by_request.get((held.name, request.id))
         if known is not None and known.request == request:
             return known
@@ -208,7 +208,7 @@ class Offers:
         return self._by_token.get(token)
 
     def take(self, offer: Offer) -> bool:
-        """Mark the offer as taken; return True only at the first call, so that it is carried out once."""
+        """Mark a command as confirmed; return True only at the first call, so that it is sent once."""
         is_first = not offer.is_taken
         offer.is_taken = True
         return is_first
@@ -223,7 +223,7 @@ class Offers:
         if left > 0:
             return ""
         age_s = (LIMIT_NS - left) / SECOND
-        return f"{age_s:.1f} s have passed since the offer, and {LIMIT_NS / SECOND:g} s is allowed"
+        return f"{age_s:.1f} s have passed since it was checked, and {LIMIT_NS / SECOND:g} s is allowed"
 
     def void(self, line: str, drives: Collection[str] | None, why: str) -> None:
         """Cancel the offered commands for these drives of a line, or for all its drives if `drives` is None.

@@ -72,7 +72,7 @@ class Observer:
         return any(record.value and record.value["ended"] for record in found) or bool(self.dead())
 
     async def rest(self, path: int) -> None:
-        """Wait until the next read is due, or until a lease record may have become stale."""
+        """Wait until the next read is due, or until a lease record may have expired."""
         begins = self._clock() - self.terms.lease
         due = ((one.since - begins) / lease_rules.SECOND for one in self._watched[path].values())
         await asyncio.sleep(min([LOOK_S, *(left for left in due if left > 0)]))
@@ -192,7 +192,7 @@ class Observer:
     async def end_the_dead(self, present: Iterable[str] | None = None) -> bool:
         """End the sessions that are no longer renewed; return True if one was ended.
 
-        A record is replaced only if it still has the revision that was found to be stale.
+        A record is replaced only if it still has the revision that has expired.
         """
         before = self.ended
         self._remember_ended_sessions()

@@ -27,8 +27,8 @@ ASKED_AT_ONCE = 500  # limit of lines in one read request; servers allow 1024
 # How long to read a record again and again after a write without an answer. The servers may store the write
 # late, once they have elected a new leader.
 DOUBT_S = 30.0
-MOST_MOVES = 100  # number of remembered moves of lines between gateways
-MOST_REPORTED = 20  # limit of the moves in the state that a gateway reports
+MOST_MOVES = 100  # number of remembered changes of lines' masters
+MOST_REPORTED = 20  # limit of such changes in the state that a gateway reports
 
 
 class FleetRecords:
@@ -135,7 +135,10 @@ class FleetRecords:
             self._note_move(line)
 
     def _note_move(self, line: str) -> None:
-        """Remember that a line has moved. Its former master is unknown if an earlier record was not read."""
+        """Remember a change of a line's master.
+
+        The former master is unknown (None) if an earlier record of the line was not read.
+        """
         record = self.owner(line)
         if not record:
             return
@@ -144,7 +147,7 @@ class FleetRecords:
         if turn != seen:
             self._masters[line] = master, turn
             known = before if turn == seen + 1 else None
-            # a gateway that claims its own line again, after an uncertain release, does not move the line
+            # the master stays the same if a gateway claims its line again after a release without an answer
             if known != master:
                 self.moves.add([Move(line, turn, record.value["since"], known, master)])
 
@@ -282,7 +285,7 @@ def move_of(sent: Any) -> Move:
 
 
 class Moves:
-    """The latest changes of lines' masters. A release of a line and the following claim are one move."""
+    """The latest changes of lines' masters. A release of a line and the following claim are one change."""
 
     def __init__(self, most: int = MOST_MOVES) -> None:
         self._most = most

@@ -137,9 +137,9 @@ async def led_clusters(path: ServerPath) -> dict[str, Cluster]:
 
 
 async def bring_leaders_home(path: ServerPath, clusters: Mapping[str, Cluster]) -> int:
-    """Hand over each bucket to its home server if that server is ready to lead.
+    """Make the server that should lead a bucket its leader, if that server is ready.
 
-    Return the number of buckets that were handed over.
+    Return the number of buckets whose leader has changed.
     """
     moved = 0
     for place, bucket in (*enumerate(names.LEASES), *enumerate(names.OWNERS)):
@@ -173,8 +173,8 @@ class LeaseTerms:
     async def keep_ahead(self, path: ServerPath, clusters: Mapping[str, Cluster]) -> bool:
         """Move the leadership of each lease bucket that has a silent server to another server.
 
-        Skip a bucket whose leadership has moved less than HAND_OVER_S ago. Return True if a move was tried.
-        Stop after a failed move, so that at most one bucket must wait for an election.
+        Skip a bucket whose leader was changed less than HAND_OVER_S ago. Stop after a change that failed, so
+        that at most one bucket must wait for an election. Return True if a change was tried.
         """
         led = {bucket: clusters[bucket] for bucket in names.LEASES if bucket in clusters}
         silent = {bucket: cluster for bucket, cluster in led.items() if cluster.has_silent}
