@@ -32,7 +32,7 @@ class Job:
 
     @property
     def port_baudrate(self) -> int:
-        """The baud rate with which a rival opens the port, and from which the rival computes its waits."""
+        """The baud rate for libraries that need one: `baudrate`, or 115200 on a line without waits."""
         return self.baudrate or 115200
 
 

@@ -1,6 +1,6 @@
 """The masters to compare, each run in a separate process (`python -m bench.masters.rivals MASTER JOB`).
 
-A rival is used as its own documentation shows, with its own waits, and no retries.
+Each other library is used as its own documentation shows, with its own waits, and no retries.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def pymodbus(job: Job) -> Iterator[Read]:
 
 @contextmanager
 def pyserial(job: Job) -> Iterator[Any]:
-    """Return a port for the rivals that use pyserial; over TCP it is pyserial's socket:// port."""
+    """Open a pyserial port, for libraries that use one. A URL opens a TCP connection."""
     import serial
 
     with serial.serial_for_url(job.port, job.port_baudrate, timeout=TIMEOUT_S) as port:

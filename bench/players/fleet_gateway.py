@@ -24,7 +24,7 @@ from multidrop.samples.spool import Spool
 
 EXCHANGES = 100  # per batch
 RATE = 1000  # exchanges per second, with 10 values each
-GAP = 1_000_000  # difference between the first numbers of successive runs
+GAP = 1_000_000  # exchange numbers reserved for each run of this program
 
 
 async def live(name: str, folder: Path, told: str, urls: list[str]) -> None:

@@ -63,9 +63,9 @@ def write_plant(directory: Path, lines: int) -> Path:
 
 
 def proofs(plant: Plant) -> dict[tuple[str, str], float]:
-    """Return the one value that each polled register always has, by drive and register name.
+    """Return the constant value of each polled register, by drive and register name.
 
-    Motors are left out, because their values change.
+    The registers of motor drives are left out, because their values change.
     """
     return {
         (drive.drive.name, poll.register.name): proof(drive.drive, poll.register)
@@ -120,7 +120,7 @@ def hostile_wires(plant: Path, faults: Faults) -> list[Wire]:
 
 @contextmanager
 def running(make: Callable[..., Sequence[Wire]], *arguments: object) -> Iterator[RunningPlant]:
-    """Start a process that calls `make(*arguments)` and simulates the returned wires."""
+    """Start a process that simulates lines: the wires that `make(*arguments)` returns there."""
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     late = context.Array("d", 2)  # the longest delay in s; the time of the last long delay

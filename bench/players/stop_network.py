@@ -124,9 +124,11 @@ def _cut_one(
     counters: Counters,
     is_long: bool,
 ) -> None:
-    """Start a motor twice, to count the reads before a start; then start it while the network is cut.
+    """Cut the network immediately before the write of a start.
 
-    If a frame moves the motor after the client reported a failed start, `counters` counts this frame."""
+    Two earlier starts show how many reads precede this write. `counters` counts frames that move the motor
+    after the client has reported a failed start.
+    """
     looks = 0
     for _ in range(2):
         begun = len(line.log)

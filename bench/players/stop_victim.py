@@ -40,7 +40,7 @@ class Counters:
 
 
 class Victim:
-    """A client process to be attacked, its responders, and the time at which stops were requested."""
+    """A client process under test, the simulated lines, and the time of the first request to stop."""
 
     def __init__(self, far: Responder, process: subprocess.Popen[str], errors: Path) -> None:
         self.far = far
@@ -85,7 +85,7 @@ class Victim:
         return self._errors.read_text()
 
     def begin(self, *, turning: bool) -> None:
-        """Start a new episode: forget earlier frames and, with `turning`, set all motors turning."""
+        """Forget the frames received so far. With `turning`, set all motors turning."""
         self.asked_ns = 0
         for line in self.lines:
             self._begun[line] = len(line.log)
@@ -101,7 +101,7 @@ class Victim:
         self.far.release(self.lines[0])
 
     def received(self, line: ResponderLine, address: int, what: str) -> list[ReceivedFrame]:
-        """Return the frames of the kind `what` (such as "stops") that the drive received in this episode."""
+        """Return the frames of the kind `what` (such as "stops") that the drive received since `begin`."""
         return [
             each
             for each in line.log[self._begun.get(line, 0) :]
@@ -109,7 +109,7 @@ class Victim:
         ]
 
     def judge(self, counters: Counters, what: str, *, excuse: bool = False) -> None:
-        """Count the results of this episode's stops.
+        """Count the results of all stops since `begin`.
 
         Set `excuse` if the client reported an aborted stop: then a motor that still turns is not a failure.
         """
@@ -145,7 +145,10 @@ def victim(
     ramp: float = 0.0,
     far: Responder | None = None,
 ) -> Iterator[Victim]:
-    """Yield a client that is ready, with a line for each list of (kind of drive, address) in `plant`."""
+    """Start a client; yield it when its lines are open.
+
+    `plant` has a list of drives for each line, each drive as (kind, address).
+    """
     with TemporaryDirectory(prefix="multidrop-stops-") as name:
         directory = Path(name)
         if far is None:

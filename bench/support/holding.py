@@ -12,7 +12,7 @@ from multidrop.drive.declaration_check import DeclarationError
 from multidrop.drive.register import Access, Register
 from multidrop.importers.device import ONLY_WRITTEN, ImportedDevice, ImportedRegister, declare
 
-DETAILS = {  # properties that an entry may need: their names in the printed table
+DETAILS = {  # properties that an imported entry may have, with their titles in the printed table
     "offset": "offset",
     "invalid": "invalid counts",
     "part": "bits of a word",
@@ -33,12 +33,12 @@ DETAILS = {  # properties that an entry may need: their names in the printed tab
 
 @dataclass(frozen=True)
 class Holding:
-    """Whether an entry can be represented fully, only for reading, or not at all, with the reason."""
+    """An entry of another program's file: whether a family can declare it fully, only for reading, or not."""
 
     entry: ImportedRegister | None  # None: the importer could not convert the entry to a register
     is_held: bool
-    is_written: bool = True  # True if the library can write the register as the other program does
-    lacks: str = ""
+    is_written: bool = True  # True if the other program does not write the register, or a family can too
+    lacks: str = ""  # reason why the family cannot declare the entry fully
     is_text: bool = False
 
     @property
@@ -89,7 +89,7 @@ def family_of(entries: list[Holding]) -> str:
     }
     for name, register in members.items():
         object.__setattr__(register, "name", name)
-        # `_why_not` has checked the scale register; here its name is another one
+        # `_why_not` has already checked the scale register, which has a new name here.
         object.__setattr__(register, "scale_register", "")
     return _refusal(members)
 

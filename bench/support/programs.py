@@ -40,7 +40,7 @@ def module(name: str, *words: object) -> list[str]:
 
 @dataclass
 class Talker:
-    """A running program that plays one or more lines; `report` is set when it has ended."""
+    """A running program that simulates one or more lines; `report` is set when it has ended."""
 
     said: str  # the program's first output: the ports of its lines
     report: dict[str, Any] = field(default_factory=dict)

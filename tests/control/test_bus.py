@@ -208,8 +208,11 @@ MISTAKES: dict[type[Exception], list[tuple[Callable[[Bus, Any], Any], str]]] = {
     ValueError: [
         (lambda bus, rig: rig.write(rig.target, 3001), "target = 3001 is outside 0 to 3000 rpm"),
         (lambda bus, rig: rig.write(rig.gain, float("nan")), "gain takes a finite number, not nan"),
-        (lambda bus, rig: rig.read(rig.target), "target of pump cannot be read: it is a command"),
-        (lambda bus, rig: rig.read(rig.speed, rig.target), "target of pump cannot be read: it is a command"),
+        (lambda bus, rig: rig.read(rig.target), "target of pump cannot be read: it is declared as a command"),
+        (
+            lambda bus, rig: rig.read(rig.speed, rig.target),
+            "target of pump cannot be read: it is declared as a command",
+        ),
         (lambda bus, rig: bus.attach(Toy, 1), "address 1 is taken by pump"),
         (lambda bus, rig: bus.attach(rig), "address 1 is taken by pump"),
         (lambda bus, rig: bus.attach(Toy, 32), "address 32 is not supported by TOY T1; choose 1 to 31"),

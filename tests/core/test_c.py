@@ -67,13 +67,13 @@ def test_a_call_in_the_silence_after_an_exchange_does_not_wake_the_thread(build:
 
 @pytest.mark.slow
 @WAITS_BY_EPOLL
-def test_the_cores_thread_does_not_spin_while_a_caller_waits(build: Callable[..., None]) -> None:
+def test_the_c_thread_sleeps_while_a_caller_waits(build: Callable[..., None]) -> None:
     build("test_spinning", *core_without("clock"))
 
 
 @pytest.mark.slow
 @WAITS_BY_EPOLL
-def test_an_exchange_of_a_steady_drive_reads_the_port_once(build: Callable[..., None]) -> None:
+def test_a_port_is_read_once_if_reply_delays_are_constant(build: Callable[..., None]) -> None:
     build("test_looks", *core_without("port"))
 
 

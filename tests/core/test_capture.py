@@ -98,11 +98,11 @@ def test_a_sniffed_frame_has_the_time_of_its_first_piece() -> None:
     assert [span.time_ns for span in spans] == [0, 1, 3]
 
 
-def test_the_copy_that_follows_a_write_request_is_its_reply() -> None:
+def test_a_frame_equal_to_the_preceding_write_request_is_its_reply() -> None:
     assert kinds(split(READ, ANSWER, *[WRITE] * 6)) == [Kind.REQUEST, Kind.REPLY] * 4
 
 
-def test_a_copy_of_a_write_request_after_junk_is_neither_request_nor_reply() -> None:
+def test_a_write_frame_after_junk_may_be_request_or_reply() -> None:
     assert kinds(split(WRITE)) == [Kind.EITHER]
     assert kinds(split(READ, ANSWER, WRITE[:-1], WRITE, READ)) == [
         *(Kind.REQUEST, Kind.REPLY, Kind.JUNK, Kind.EITHER, Kind.REQUEST)

@@ -277,7 +277,7 @@ def test_an_empty_list_of_codes_gives_an_empty_column() -> None:
 BLOCK = RowLayout(0, [Field(0, NumberFormat.U16, register, 1.0, 1.0) for register in range(3)])
 
 
-def test_a_reply_of_a_block_without_registers_adds_no_row() -> None:
+def test_a_missed_block_without_registers_adds_no_row() -> None:
     row_queue = RowQueue()
     row_queue.add_miss(RowLayout(0, []), Status.NOT_ASKED, 5)
     assert (row_queue.chunks, row_queue.dropped, row_queue.take()) == (0, 0, None)

@@ -263,7 +263,7 @@ def test_repeat_repeats_exchanges_until_they_are_replaced(port: Port, rows: Rows
     assert status_of(port.carry_out(read(9))) == 0
 
 
-def test_repeat_returns_the_index_of_the_exchange_that_would_have_been_next(port: Port, rows: Rows) -> None:
+def test_the_next_of_the_replaced_exchanges_is_returned_by_repeat(port: Port, rows: Rows) -> None:
     port.repeat([read(0), read(1), read(2)])
     rows.of("value", 20)
     following = port.repeat([])
@@ -284,7 +284,7 @@ def test_queued_exchanges_are_carried_out_between_repeated_exchanges(port: Port,
     assert sent[at] >= due_ns
 
 
-def test_exchanges_are_no_longer_repeated_once_one_cannot_be_sent(drive: Drive) -> None:
+def test_repetition_ends_at_an_exchange_that_cannot_be_sent(drive: Drive) -> None:
     slow = Peer(least_timeout=0.01, most_timeout=0.02)
     with closing(Port(drive(lambda _: b""), NO_SETTINGS)) as port:
         assert port.carry_out(read(1, peer=slow)).result == Failure.NO_REPLY
@@ -310,7 +310,7 @@ def test_a_waiting_client_wakes_when_a_drive_fails_or_recovers(drive: Drive) -> 
         silent.clear()
         wait_until(lambda: now_ns() > peer.late_until_ns)
         port.repeat(asked)
-        # await_calls also returns at the end of the queue
+        # The first return may only report that no exchange is queued.
         while peer.failures:
             assert row_queue.await_calls(60) == [17]
 

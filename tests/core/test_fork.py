@@ -30,7 +30,7 @@ from multidrop.poller import Poller
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 
 pytestmark = pytest.mark.filterwarnings(
-    "ignore:.*fork:DeprecationWarning",  # Python warns if another thread holds a lock, as in these tests
+    "ignore:.*fork:DeprecationWarning",  # Python's warning about a fork while other threads run
     "ignore:set(Daemon|Name)\\(\\) is deprecated:DeprecationWarning",
 )
 
@@ -212,7 +212,7 @@ def test_a_child_does_not_wait_for_a_bus_lock_held_in_the_parent(port: str) -> N
 
     with Bus(port) as bus:
         assert current(bus) == 3.25
-        # in the parent, a stop on another thread is in progress
+        # This stop stays in progress in the parent until `over` is called.
         stop = threading.Thread(target=bus._latches.begin, args=["stop", bus.drives])
         stop.start()
         stop.join()
@@ -223,7 +223,7 @@ def test_a_child_does_not_wait_for_a_bus_lock_held_in_the_parent(port: str) -> N
 
 
 @pytest.mark.slow
-def test_an_inherited_poller_is_closed_and_has_no_rows(port: str) -> None:
+def test_a_poller_is_closed_and_empty_in_a_forked_child(port: str) -> None:
     def look() -> list[Any]:
         found = [poller.take(), poller.summary()["lines"].keys(), poller.fileno() > 0]
         poller.close()

@@ -37,7 +37,9 @@ RTU, ASCII, DELIXI = Framing.RTU, Framing.ASCII, Framing.DELIXI
 GOOD_REQUESTS = [each for each in PRINTED if each.direction == "request" and each.verdict != "bad checksum"]
 GOOD_REPLIES = [each for each in PRINTED if each.direction == "reply" and isinstance(each.says, Message)]
 REFUSED = [each for each in PRINTED if isinstance(each.says, FrameFault)]
-MISPRINTED = "01 89 01 86 50"  # from manual E13; accepted, but never sent by the simulators
+# The manual of the ER-G-220 prints this reply with 89H instead of 88H. It is accepted, but simulators never
+# send it.
+MISPRINTED = "01 89 01 86 50"
 
 
 def parse(printed: Printed, received: bytes) -> tuple[int, Message | None]:
@@ -76,7 +78,7 @@ def test_all_frames_printed_in_manuals_are_tested() -> None:
     assert len(GOOD_REQUESTS) + len(GOOD_REPLIES) + len(REFUSED) == len(PRINTED)
 
 
-def test_printed_frames_are_parsed_to_their_documented_meaning() -> None:
+def test_frames_from_manuals_are_parsed_as_documented() -> None:
     for printed in GOOD_REQUESTS + GOOD_REPLIES:
         assert parse(printed, printed.frame) == (len(printed.frame), printed.says)
 
@@ -180,7 +182,8 @@ WRONG = [
     ("half a register more", RTU, READ_TWO, rtu("01 03 05 11 11 22 22 33"), FrameFault.BAD_LENGTH),
     ("no register", RTU, READ_TWO, rtu("01 03 00"), FrameFault.BAD_LENGTH),
     ("16 coils for 8", RTU, Message(1, 0x01, 0, 8), rtu("01 01 02 FF FF"), FrameFault.BAD_LENGTH),
-    # pymodbus accepts another value; libmodbus also another address (functions 05, 06 and 10H)
+    # Confirmations of writes, functions 05, 06 and 10H. If the value differs, pymodbus and libmodbus accept
+    # them. If the address differs, libmodbus still accepts them.
     ("coil confirmed off that was set on", RTU, WRITE_COIL, rtu("01 05 00 03 00 00"), FrameFault.BAD_ECHO),
     ("another coil confirmed", RTU, WRITE_COIL, rtu("01 05 00 04 FF 00"), FrameFault.BAD_ECHO),
     ("another value confirmed", RTU, WRITE_ONE, rtu("01 06 00 10 12 35"), FrameFault.BAD_ECHO),
@@ -188,8 +191,8 @@ WRONG = [
     ("another start confirmed", RTU, WRITE_TWO, rtu("01 10 00 11 00 02"), FrameFault.BAD_ECHO),
     ("fewer registers confirmed", RTU, WRITE_TWO, rtu("01 10 00 10 00 01"), FrameFault.BAD_ECHO),
     ("another loopback", RTU, LOOPBACK, rtu("01 08 00 00 A5 38"), FrameFault.BAD_ECHO),
-    # The late replies below have another function, address or length. If all three fit, every library accepts
-    # a late reply.
+    # Late replies with another function, address or length are rejected. A late reply in which all three fit
+    # cannot be recognised by its bytes.
     ("late, to a longer read", RTU, READ_TWO, rtu("01 03 08 00 00 00 00 00 00 00 00"), FrameFault.BAD_LENGTH),
     ("late, to a write", RTU, READ_TWO, rtu("01 06 00 10 12 34"), FrameFault.BAD_FUNCTION),
     ("late, of the drive before", RTU, READ_TWO, rtu("02 03 04 11 11 22 22"), FrameFault.BAD_ADDRESS),
@@ -240,7 +243,7 @@ def test_a_stray_zero_before_each_reply_loses_no_value() -> None:
 def test_refusal_codes_of_the_delixi_protocol_are_returned_as_exceptions(code: int) -> None:
     frame = build_reply(DELIXI, Message(1, RUN_FORWARD.function, exception=code))
     assert parse_reply(DELIXI, frame, RUN_FORWARD) == (21, Message(1, 2, exception=code))
-    assert parse_request(DELIXI, frame) == (FrameFault.BAD_FUNCTION, None)  # no master sends it (note 2)
+    assert parse_request(DELIXI, frame) == (FrameFault.BAD_FUNCTION, None)  # only drives send a refusal
 
 
 def test_delixis_state_is_read_from_the_parameter_field_of_the_reply() -> None:

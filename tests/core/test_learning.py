@@ -267,7 +267,7 @@ def test_a_late_reply_is_expected_after_a_lost_port_is_reopened(line: LineDriver
 
 
 @pytest.mark.parametrize("is_row", [True, False], ids=["for a row", "for a client"])
-def test_a_doubtful_polled_value_has_the_time_of_the_earlier_request(
+def test_a_polled_value_has_the_first_requests_time_if_it_may_be_late(
     line: LineDriver, drive: Peer, is_row: bool
 ) -> None:
     """A read by `Bus` gets no value yet: the core must first be sure that no late reply is due."""
@@ -292,7 +292,7 @@ def test_a_doubtful_polled_value_has_the_time_of_the_earlier_request(
 
 
 @pytest.mark.parametrize(("asked", "times"), [(READ, 2), (WRITE, 1)], ids=["a read", "a write"])
-def test_only_reads_are_repeated_if_the_reply_is_in_doubt(drive: Peer, asked: Message, times: int) -> None:
+def test_only_reads_are_repeated_if_the_reply_may_be_late(drive: Peer, asked: Message, times: int) -> None:
     """The reply may be to an earlier request. A write is not repeated: it may have started a motor."""
     slots, turn = ffi.new("struct md_slot[]", 1), ffi.new("struct md_turn *")
     wake, found = ffi.new("int64_t *"), ffi.new("struct md_completion *")
@@ -552,7 +552,7 @@ def all_looks(
     return [looks(line, drive, delay, details) for delay in delays]
 
 
-def test_seven_of_eight_replies_to_a_steady_drives_reads_are_taken_at_once(
+def test_seven_of_eight_replies_are_read_at_once_if_delays_are_constant(
     line: LineDriver, drive: Peer
 ) -> None:
     all_looks(line, drive, STEADY, FOR_A_CLIENT)
@@ -573,13 +573,13 @@ def test_replies_of_a_drive_with_varying_delays_are_read_without_delay(line: Lin
     assert {late for _, late in all_looks(line, drive, 20 * [15 * MS, 19 * MS], FOR_A_CLIENT)} == {0}
 
 
-def test_the_port_is_read_earlier_when_a_steady_drive_becomes_quicker(line: LineDriver, drive: Peer) -> None:
+def test_the_port_is_read_earlier_when_constant_delays_become_shorter(line: LineDriver, drive: Peer) -> None:
     all_looks(line, drive, [*STEADY, *(120 * [5 * MS])], FOR_A_CLIENT)
     assert looks(line, drive, 5 * MS, FOR_A_CLIENT)[1] <= CHARACTER
     assert drive.response_delay < 6e-3
 
 
-def test_the_port_is_read_later_when_a_steady_drive_becomes_slower(line: LineDriver, drive: Peer) -> None:
+def test_the_port_is_read_later_when_constant_delays_become_longer(line: LineDriver, drive: Peer) -> None:
     found = all_looks(line, drive, [*STEADY, *(120 * [18 * MS])], FOR_A_CLIENT)
     assert max(late for _, late in found) <= CHARACTER
     assert drive.response_delay > 17.5e-3

@@ -248,7 +248,7 @@ def test_noise_before_the_requests_first_byte_restarts_the_silence(line: LineDri
 @pytest.mark.parametrize("taken", [0, 3])
 def test_bytes_received_before_the_request_is_sent_are_not_its_reply(line: LineDriver, taken: int) -> None:
     line.begin(exchange(READ))
-    line.now += SILENCE + TIMEOUT  # the request is sent although the line was never silent
+    line.now += SILENCE + TIMEOUT  # longest wait for silence; then the request is sent in any case
     assert [line.want, line.want] == ["read", "write"]
     line.take(taken)
     line.receive(reply_of(1111))
@@ -301,8 +301,9 @@ def test_an_exception_ends_the_exchange_immediately(line: LineDriver) -> None:
 
 
 NOISE = random.Random(3).randbytes(5)
-TWENTY_SIX = rtu("01 04 34 bf 31 5d 78 41 9a ed 42 47 bf f8 97")  # 15 bytes of a longer reply, and their CRC
-WHOLE = rtu((TWENTY_SIX + bytes(range(55 - len(TWENTY_SIX)))).hex())
+# start of a reply of 26 registers, in which two bytes are the correct CRC of the bytes before them
+START_WITH_CRC = rtu("01 04 34 bf 31 5d 78 41 9a ed 42 47 bf f8 97")
+WHOLE = rtu((START_WITH_CRC + bytes(range(55 - len(START_WITH_CRC)))).hex())
 
 
 @table(
@@ -445,7 +446,7 @@ def test_a_reply_is_found_after_4096_bytes_of_noise(line: LineDriver, seed: int,
 
 
 @pytest.mark.parametrize("received", [b"\x01\x03\xfa", b"\x01", b"\x01\x83", b"\x04\x04", b"\xff"])
-def test_a_search_in_endless_garbage_keeps_less_than_a_frame(line: LineDriver, received: bytes) -> None:
+def test_few_bytes_are_kept_while_endless_garbage_arrives(line: LineDriver, received: bytes) -> None:
     ask(line, Message(1, 0x03, 0, 125))
     garbage = received * 20_000
     for at in range(0, len(garbage), 64):
@@ -685,7 +686,9 @@ def query(line: LineDriver) -> None:
 
 @pytest.mark.parametrize("piece", [4096, 1], ids=["whole", "byte by byte"])
 @pytest.mark.parametrize("gap", [0, 5 * MS, TIMEOUT // 2])
-def test_a_first_echo_is_not_taken_for_a_value_of_0(line: LineDriver, gap: int, piece: int) -> None:
+def test_an_echoed_query_is_not_taken_for_a_reply_with_value_0(
+    line: LineDriver, gap: int, piece: int
+) -> None:
     query(line)
     line.receive(ECHO, piece)
     assert line.listens

@@ -254,5 +254,7 @@ def test_a_suspended_master_with_a_deadline_that_is_too_late_does_send() -> None
     """This shows that the tests above can fail: here the master's deadline is too late."""
     with fence(beyond=1000) as made:
         found = rounds(made, 4)
-    assert any(each.stale > 0 for each in found)  # on a busy computer, some masters resume too late to send
+    # Only one master must have sent: on a busy computer, the others may resume too late even for this
+    # deadline.
+    assert any(each.stale > 0 for each in found)
     assert not any(each.is_killed for each in found)

@@ -61,7 +61,9 @@ def test_a_port_can_be_set_to_any_baud_rate(pty: int, baudrate: int) -> None:
         ("7E1", {"data bits", "parity"}, "8N1"),
     ],
 )
-def test_settings_a_pty_refuses_are_reported(pty: int, format: str, not_taken: set[str], taken: str) -> None:
+def test_unsupported_settings_of_a_pseudo_terminal_are_reported(
+    pty: int, format: str, not_taken: set[str], taken: str
+) -> None:
     assert refused(pty, 9600, format) == not_taken
     assert get_settings(pty) == (9600, taken)
 

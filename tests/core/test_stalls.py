@@ -168,7 +168,7 @@ def test_a_stop_does_not_wait_for_a_read_that_waits_for_a_stalled_adapter(ends: 
     """The read is sent after the stop, once the adapter has taken the stop and the earlier read."""
     assert port.carry_out(exchange(READ)).result == Failure.NO_REPLY
     port.submit([exchange(OTHER)] + [exchange(OTHER, timeout=0.2)] * 64, [0] * 65)
-    until(lambda: port.done > 0)  # the first read was not sent; now the second one waits
+    until(lambda: port.done > 0)  # the first queued read has ended unsent; the second one waits
     assert port.carry_out(exchange(STOP, insists=True)).sent_ns > 0
     assert taken(ends[1]) == [frame(READ), frame(STOP)]
     select.select([ends[1]], [], [])
@@ -209,7 +209,7 @@ def test_a_reply_after_a_stall_is_not_taken_for_the_reply_to_the_next_read(ends:
 def test_polling_ends_without_waiting_for_a_read_on_a_stalled_adapter(port: Port) -> None:
     assert port.carry_out(exchange(READ)).result == Failure.NO_REPLY
     port.submit([exchange(READ), exchange(READ, timeout=30.0)], [0, 0])
-    until(lambda: port.done > 0)  # the first read was not sent; now the second one waits
+    until(lambda: port.done > 0)  # the first queued read has ended unsent; the second one waits
     assert not port.end()
 
 
@@ -227,7 +227,7 @@ def test_a_broadcast_command_does_not_wait_for_late_replies(free_port: Port) -> 
     assert free_port.carry_out(set_all).sent_ns > 0
 
 
-def test_a_port_is_lost_if_its_adapter_holds_a_command_until_the_timeout(port: Port) -> None:
+def test_a_port_is_lost_if_its_adapter_does_not_accept_a_command(port: Port) -> None:
     start = port.carry_out(exchange(START))
     assert (start.result, start.error) == (Failure.LINE_LOST, errno.ETIMEDOUT)
     assert start.sent_ns > 0
@@ -281,13 +281,15 @@ def test_a_wrong_count_of_unsent_bytes_does_not_delay_other_drives(ends: Ends, p
         for request in requests[:2]:
             assert port.carry_out(patient(request)).result > 0
         assert port.carry_out(exchange(SILENT, timeout=0.2)).result == Failure.NO_REPLY
-        assert port.carry_out(patient(READ)).result > 0  # sent after a wait of 1 s for the unsent bytes
+        assert port.carry_out(patient(READ)).result > 0  # sent 1 s later, because SILENT seems to be unsent
         assert port.carry_out(exchange(SILENT, timeout=0.2)).result == Failure.NO_REPLY
     assert (port.miscounts, port.is_stalled) == (True, False)
 
 
 @pytest.mark.parametrize(("failures", "was_wrong", "seconds"), [(0, 0, 30), (1, 0, 40), (0, 1, 1), (1, 1, 1)])
-def test_an_answering_drive_is_read_first_after_a_stall(failures: int, was_wrong: int, seconds: int) -> None:
+def test_a_stalled_request_waits_longer_if_its_drive_failed_before(
+    failures: int, was_wrong: int, seconds: int
+) -> None:
     peer, line = Peer(least_timeout=1, most_timeout=1), LineDriver()
     peer.c.failures = failures
     line.begin(exchange(READ, peer=peer))
@@ -306,7 +308,7 @@ def test_a_wrong_count_of_unsent_bytes_is_ignored_after_three_replies(ends: Ends
     assert port.miscounts
 
 
-def test_a_count_of_unsent_bytes_that_falls_after_each_reply_is_not_ignored(ends: Ends, port: Port) -> None:
+def test_a_delayed_count_of_unsent_bytes_is_not_ignored(ends: Ends, port: Port) -> None:
     with Device(ends[1], 5, lag=TIMEOUT_S / 2):
         for _ in range(5):
             assert port.carry_out(patient(READ)).result > 0

@@ -231,7 +231,7 @@ def test_each_request_gets_its_own_reply_in_any_order(drive: Peer) -> None:
         assert line.data_after(b"".join(came), chance.choice([1, 3, 17, 4096])) == words(7)
 
 
-def test_a_request_is_sent_immediately_although_a_late_reply_is_due(line: LineDriver, drive: Peer) -> None:
+def test_a_tcp_request_is_sent_immediately_after_a_missing_reply(line: LineDriver, drive: Peer) -> None:
     for request in (READ, WRITE, WRITE):
         ask(line, drive, request)
         line.wait_until_done()

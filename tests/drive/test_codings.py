@@ -315,13 +315,13 @@ def test_a_raw_count_declared_invalid_is_read_as_no_value(
         (NumberFormat.BCD16, None, 9999, "99 99"),
         # the "no value" count does not fit into bit 0, so it is compared with the whole word
         (NumberFormat.U16, (0, 0), 0xFFFF, "FF FF"),
-        # the "no value" count fits into the register's bits, so it is compared with these bits
+        # the "no value" count fits into the bits of the register, and only these bits are compared
         (NumberFormat.U16, (0, 7), 0xFF, "12 FF"),
         (NumberFormat.U16, (8, 15), 0xFF, "FF 12"),
         (NumberFormat.I16, (0, 3), -8, "00 08"),
     ],
 )
-def test_an_invalid_raw_count_gives_no_value_in_every_number_format(
+def test_an_invalid_raw_count_is_recognised_in_all_number_formats(
     number_format: NumberFormat, part: Any, invalid: Any, wire: str
 ) -> None:
     data = bytes.fromhex(wire)
@@ -334,7 +334,7 @@ def test_an_invalid_raw_count_gives_no_value_in_every_number_format(
     assert register.value_in(other, 0) is not None
 
 
-def test_bus_raises_no_value_when_a_drive_returns_an_invalid_raw_count() -> None:
+def test_a_read_raises_an_error_if_a_raw_count_is_invalid() -> None:
     family = declared(
         level=reading(0, "m", invalid=0x7FFF),
         speed=reading(1, "rpm"),

@@ -250,7 +250,7 @@ def test_all_mistakes_in_a_drive_class_are_reported_together() -> None:
     "step": "0.1", "span": (2, 1), "number_format": "f32", "kept": "RAM", "table": "coil", "default": "x",
     "harmless": (1.5,), "broadcast": 3, "never": 1, "ram_address": -1, "at_least": "none", "moves": 7,
 }.items()}))  # fmt: skip
-def test_every_combination_of_mistakes_in_a_drive_class_gives_one_line_errors(wrong: dict[str, Any]) -> None:
+def test_each_error_of_a_wrong_drive_class_fits_on_one_line(wrong: dict[str, Any]) -> None:
     register = setting(1, "V", **wrong)
     if wrong:
         assert mistakes_in(v=register)
@@ -414,7 +414,7 @@ def test_mistake_in_a_subclass_of_a_built_in_family_is_reported() -> None:
         type("Ours", (InnovertIBD,), {"stop": lambda self: None})
 
 
-def test_a_class_without_a_motor_has_no_register_that_moves_one() -> None:
+def test_a_motor_command_is_refused_in_a_class_without_a_motor() -> None:
     (mistake,) = mistakes_in(reset=command(0x2000), has_motor=False)
     assert mistake == "has_motor = False, but a write to reset may move one: declare moves=False"
     assert not declare(reset=command(0x2000, moves=False), has_motor=False).has_motor

@@ -210,7 +210,7 @@ def metered() -> BusAndTank:
     return line, line.attach(Tank(1, name="tank"))
 
 
-def test_read_of_one_register_returns_its_value_and_of_several_a_dict(metered: BusAndTank) -> None:
+def test_a_read_of_several_registers_returns_their_values_by_name(metered: BusAndTank) -> None:
     line, tank = metered
     assert tank.read(tank.level) == tank.read("level") == 2.5
     sent = len(line.frames)

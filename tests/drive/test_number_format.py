@@ -23,7 +23,7 @@ from multidrop.sim import SimulatedDrive
 
 SEVERAL = Table("holding register, several at once", 0x03, 0x10)
 RELAYS = Table("coil, several at once", 0x01, 0x0F, Carrier.BIT)
-PACKED = {  # names of number formats in documents
+PACKED = {  # the number formats in the notation of `struct`
     NumberFormat.U16: ">H",
     NumberFormat.I16: ">h",
     NumberFormat.U32: ">I",

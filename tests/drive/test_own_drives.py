@@ -150,7 +150,7 @@ def test_start_of_a_drive_without_identify_needs_confirmation(name: str) -> None
         command_it(line, pump)
     assert str(refusal.value) == (
         f"{name} is not sent to pump: its class cannot identify a Pump, and the same write may start "
-        "another make: read the drive's name plate, and declare confirmed = 1"
+        "another make: read the drive's name plate; then declare confirmed = 1"
     )
     assert line.frames == []
     line.bus.detach(pump)
@@ -198,7 +198,7 @@ def test_stop_of_a_drive_without_identify_needs_no_confirmation(name: str) -> No
     assert written(line) == [STOP]
 
 
-def test_start_of_a_drive_with_identify_needs_no_confirmation() -> None:
+def test_a_start_needs_no_confirmation_if_the_drive_can_be_identified() -> None:
     assert "confirmed" in Pump.options
     line = SimulatedBus(simulated(Known(1)))
     line.attach(Known(1)).start()

@@ -148,7 +148,7 @@ def test_typed_text_is_parsed_to_a_value() -> None:
         Example.run.parse("go|stop")
 
 
-def test_attribute_words_is_the_number_of_addresses_of_a_register() -> None:
+def test_a_32_bit_register_has_two_addresses() -> None:
     assert (Example.energy.words, Example.current.words, Example.coil.words) == (2, 1, 1)
 
 
@@ -264,7 +264,7 @@ def test_state_is_computed_again_for_a_register_value_of_nan() -> None:
     assert len(Counting.looks) == 2
 
 
-def test_state_is_computed_each_time_if_its_method_sets_attributes() -> None:
+def test_a_state_is_always_recomputed_if_the_method_sets_attributes() -> None:
     reader = StateReader(Noting(1))
     shown = [reader.state({"speed": speed}) for speed in (25.0, 0.0, 0.0, 0.0, 25.0, 0.0, 0.0)]
     assert shown == [RUNS, RUNS, STANDS, STANDS, RUNS, RUNS, STANDS]
@@ -397,7 +397,7 @@ def test_polling_a_text_or_reading_another_familys_text_raises_an_error() -> Non
         drive.read(Other.serial)
     with pytest.raises(AttributeError, match=r"serial is a text; read it with drive.read"):
         drive.serial = "x"
-    with pytest.raises(ValueError, match="maker holds 6 characters, not 7"):
+    with pytest.raises(ValueError, match="maker can hold 6 characters, not 7"):
         line.sims[0]["maker"] = "1234567"
 
 
@@ -504,7 +504,7 @@ def test_the_first_language_with_register_titles_is_chosen(tags: list[str], lang
     assert chosen_language(tags) == language
 
 
-def test_a_unit_and_an_enumeration_may_be_keywords() -> None:
+def test_a_unit_or_an_enumeration_can_be_a_keyword_argument() -> None:
     assert reading(0x10, unit="kW").unit == "kW"
     assert reading(0x10, values=IntEnum("Mode", "SLOW")).values is not None
 
@@ -514,7 +514,7 @@ def test_text_with_one_character_per_register_is_in_the_low_bytes() -> None:
     assert version.decode(bytes.fromhex("0034 002E 0031 0000 0041")) == "4.1"
     assert version.decode(bytes.fromhex("FF34 FF2E FF31 FF38 FF20")) == "4.18"
     assert version.encode("4.1") == bytes.fromhex("0034 002E 0031 0000 0000")
-    with pytest.raises(ValueError, match="holds 5 characters, not 6"):
+    with pytest.raises(ValueError, match="can hold 5 characters, not 6"):
         version.encode("4.18.1")
     with pytest.raises(ValueError, match="a text has order = 'A'; it must be 'AB', 'BA' or 'B'"):
         Text(1, 1, order="A")

@@ -554,7 +554,7 @@ def test_yd1000_panel_can_run_the_motor_after_release_control() -> None:
     assert not sim.motor.energised
     sim.panel_runs = True
     assert sim.motor.energised
-    with pytest.raises(Unsupported, match="no command that returns control"):
+    with pytest.raises(Unsupported, match="no release_control command"):
         one(DelixiModbus(1))[1].release_control()
 
 

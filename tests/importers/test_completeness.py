@@ -354,7 +354,7 @@ def test_template_parameters_nested_devices_and_comments_are_read(bench: Any, tm
     }
 
 
-def test_template_entries_that_do_not_fit_into_one_class_are_reported(bench: Any, tmp_path: Path) -> None:
+def test_device_entries_that_conflict_in_one_drive_class_are_counted(bench: Any, tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text(wb([{"address": 5, "scale": 0.1}, {"address": 5, "scale": 1}]))
     coverage = covered(bench, tmp_path)
     assert (coverage.whole, coverage.refused.total()) == (0, 1)
@@ -407,7 +407,7 @@ OTHERS = {
 }
 
 
-def test_template_tables_of_modpoll_are_read(bench: Any, tmp_path: Path) -> None:
+def test_device_files_of_the_program_modpoll_are_counted(bench: Any, tmp_path: Path) -> None:
     (tmp_path / "meter.csv").write_text(MODPOLL)
     coverage = covered(bench, tmp_path)
     assert shares(coverage) == {"templates": (2, 1), "entries": (9, 8), "read": (9, 8)}
@@ -416,7 +416,7 @@ def test_template_tables_of_modpoll_are_read(bench: Any, tmp_path: Path) -> None
     assert (needed["order of bytes or words"], needed["bits of a word"], needed["text"]) == (3, 1, 1)
 
 
-def test_template_files_of_every_importer_layout_are_read(bench: Any, tmp_path: Path) -> None:
+def test_device_files_of_all_other_supported_programs_are_counted(bench: Any, tmp_path: Path) -> None:
     pytest.importorskip("yaml")
     for name, contents in OTHERS.items():
         (tmp_path / name).write_text(contents)

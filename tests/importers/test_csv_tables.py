@@ -212,7 +212,7 @@ WRITTEN = ["it is written there; what a write does is not known here"]
         ("sometimes", ["its access 'sometimes' is not known; it is read here"]),
     ],
 )
-def test_write_or_unknown_access_in_a_csv_table_is_reported(
+def test_an_unknown_or_writable_access_in_a_csv_table_is_reported(
     tmp_path: Path, word: str, said: list[str]
 ) -> None:
     assert found(row(tmp_path, "address,type,access", f"0x10,uint16,{word}")) == said
@@ -236,7 +236,7 @@ def test_csv_columns_that_are_not_imported_are_reported(tmp_path: Path) -> None:
     assert omissions(device) == ["the column wobble: is not known here, and was not carried over"]
 
 
-def test_numbers_in_a_csv_column_register_are_addresses(tmp_path: Path) -> None:
+def test_numbers_in_a_csv_column_named_register_are_addresses(tmp_path: Path) -> None:
     device = only(tmp_path, "t.csv", "Register,Name,Type\n16,volts,uint16\n")
     assert entries(device)["volts"]["at"] == 16
 
@@ -247,7 +247,7 @@ def test_lines_above_the_column_names_of_a_csv_table_are_skipped(tmp_path: Path)
 
 
 @pytest.mark.parametrize("comma", [",", ";", "\t"])
-def test_the_first_column_of_a_csv_table_may_have_the_name_hash(tmp_path: Path, comma: str) -> None:
+def test_the_first_csv_column_may_be_named_with_a_hash_sign(tmp_path: Path, comma: str) -> None:
     lines = ["# a comment", "#,Name,Address,Type", "1,volts,0x10,uint16", "#2,amperes,0x11,uint16"]
     device = only(tmp_path, "t.csv", "\n".join([lines[0], *(one.replace(",", comma) for one in lines[1:])]))
     assert {name: entry["at"] for name, entry in entries(device).items()} == {"volts": 16}
@@ -275,7 +275,7 @@ def test_invalid_csv_table_raises_value_error_with_the_reason(tmp_path: Path, te
         only(tmp_path, "t.csv", text)
 
 
-def test_missing_modpoll_byte_order_defaults_to_be_le_and_is_reported(tmp_path: Path) -> None:
+def test_a_missing_byte_order_of_modpoll_is_assumed_and_reported(tmp_path: Path) -> None:
     text = "device,m,1\npoll,holding_register,0,4,{}\nref,a,0,uint32,{},V,0.1{}\n"
     device = only(tmp_path, "m.csv", text.format("", "r", ""))
     assert entries(device)["a"]["order"] == "CDAB"
@@ -287,7 +287,7 @@ def test_missing_modpoll_byte_order_defaults_to_be_le_and_is_reported(tmp_path: 
         only(tmp_path, "m.csv", text.format("BE_BE", "r", ",more"))
 
 
-def test_byte_order_of_a_modpoll_poll_does_not_apply_to_texts(tmp_path: Path) -> None:
+def test_a_byte_order_of_modpoll_does_not_apply_to_texts(tmp_path: Path) -> None:
     text = "device,m,1\npoll,holding_register,0,4,LE_LE\nref,a,0,string8,r\nref,b,4,bool8,r\n"
     device = only(tmp_path, "m.csv", text)
     assert entries(device)["a"] == {"at": 0, "length": 4}

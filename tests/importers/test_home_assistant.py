@@ -38,7 +38,7 @@ def sensor(folder: Path, keys: str, kind: str = "sensors") -> ImportedDevice:
         ('data_type: custom, count: 1, structure: ">H"', None),
     ],
 )
-def test_home_assistant_width_may_be_given_by_count_or_structure(
+def test_a_home_assistant_sensor_has_the_width_of_its_count_or_structure(
     tmp_path: Path, keys: str, number_format: str | None
 ) -> None:
     device = sensor(tmp_path, keys)
@@ -46,7 +46,7 @@ def test_home_assistant_width_may_be_given_by_count_or_structure(
     assert gaps(device, "a") == []
 
 
-def test_missing_or_contradictory_home_assistant_width_is_reported(tmp_path: Path) -> None:
+def test_a_missing_or_contradictory_sensor_width_is_reported(tmp_path: Path) -> None:
     device = sensor(tmp_path, "data_type: float")
     assert entries(device)["a"]["number_format"] == "F16"
     assert "the width of its type float is not stated" in gaps(device, "a")[0]
@@ -212,14 +212,16 @@ def test_invalid_home_assistant_document_raises_value_error(tmp_path: Path, text
         ("type: serial, port: !secret port", "/dev/ttyUSB0"),
     ],
 )
-def test_unknown_home_assistant_host_never_becomes_a_port(tmp_path: Path, hub: str, port: str) -> None:
+def test_an_unknown_home_assistant_host_is_replaced_by_a_placeholder(
+    tmp_path: Path, hub: str, port: str
+) -> None:
     device = only(tmp_path, "a.yaml", f"modbus:\n  - {{{hub}, sensors: [{{slave: 1, address: 1}}]}}\n")
     assert tomllib.loads(plant_text(device, "m.toml"))["line"][0]["port"] == port
     assert ("the hub: its type udp is not spoken here" in omissions(device)) == ("udp" in hub)
 
 
 @pytest.mark.parametrize("unit", [0, 248, 255])
-def test_home_assistant_slave_outside_1_to_247_on_tcp_gets_family_and_plant(
+def test_a_home_assistant_slave_above_247_is_imported_only_on_tcp(
     run: Run, tmp_path: Path, unit: int
 ) -> None:
     source, family, plant = (tmp_path / name for name in ("a.yaml", "m.toml", "plant.toml"))

@@ -74,7 +74,7 @@ def test_modpoll_table_becomes_loadable_families(tmp_path: Path) -> None:
     assert (registers["voltage"].table.name, registers["voltage"].step) == ("input register", 0.1)
 
 
-def test_neuron_table_becomes_loadable_families(tmp_path: Path) -> None:
+def test_a_csv_table_of_the_neuron_gateway_becomes_loadable_families(tmp_path: Path) -> None:
     device = only(tmp_path, "tags.csv", NEURON)
     found = entries(device)
     assert device.address == 1

@@ -40,7 +40,7 @@ def of_a_request(folder: Path, keys: str, more: str = "") -> ImportedDevice:
         ('byte_order = "AB", data_type = "BIT", bit = 3, address = [5]', {"part": "3"}),
     ],
 )
-def test_telegraf_float32_is_a_whole_number_if_the_style_is_register(
+def test_a_float32_type_is_a_whole_number_in_telegrafs_register_style(
     tmp_path: Path, keys: str, expected: dict[str, object]
 ) -> None:
     found = entries(of_registers(tmp_path, keys))["a"]
@@ -48,7 +48,7 @@ def test_telegraf_float32_is_a_whole_number_if_the_style_is_register(
     assert found == expected
 
 
-def test_telegraf_float32_is_a_float_if_the_style_is_request_or_metric(tmp_path: Path) -> None:
+def test_a_float32_type_is_a_float_in_telegrafs_other_styles(tmp_path: Path) -> None:
     assert entries(of_a_request(tmp_path, 'address = 5, type = "FLOAT32"'))["a"]["number_format"] == "F32"
     metric = (
         '[[inputs.modbus.metric]]\nslave_id = 1\nfields = [{ name = "b", address = 5, type = "FLOAT32" }]\n'
@@ -56,7 +56,7 @@ def test_telegraf_float32_is_a_float_if_the_style_is_request_or_metric(tmp_path:
     assert entries(only(tmp_path, "t.conf", HEAD + metric))["b"]["number_format"] == "F32"
 
 
-def test_telegraf_float64_is_not_imported_if_the_style_is_register(tmp_path: Path) -> None:
+def test_a_float64_type_is_refused_in_telegrafs_register_style(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="a: its type FLOAT64 has no number format"):
         of_registers(tmp_path, 'byte_order = "ABCD", data_type = "FLOAT64", address = [5, 6, 7, 8]')
 
@@ -115,7 +115,9 @@ def test_pauses_that_telegraf_keeps_for_a_device_are_reported(tmp_path: Path) ->
         ('controller = "tcp://gate:${PORT}"', {"port": "tcp://HOST:502"}),
     ],
 )
-def test_telegraf_controller_has_line_settings(tmp_path: Path, line: str, expected: dict[str, str]) -> None:
+def test_a_telegraf_controller_url_sets_port_and_framing(
+    tmp_path: Path, line: str, expected: dict[str, str]
+) -> None:
     field = 'holding_registers = [{ name = "a", byte_order = "AB", data_type = "INT16", address = [7] }]\n'
     (device,) = devices(tmp_path, "t.conf", f"[[inputs.modbus]]\nslave_id = 1\n{line}\n{field}")
     (plant,) = tomllib.loads(plant_text(device, "m.toml"))["line"]

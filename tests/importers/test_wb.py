@@ -181,7 +181,9 @@ def test_value_names_are_imported_if_their_numbers_are_text(tmp_path: Path) -> N
         ({"format": "string8", "word_order": "little_endian"}, "a text whose word_order is little_endian"),
     ],
 )
-def test_wb_mqtt_text_in_unknown_order_is_reported(tmp_path: Path, keys: dict[str, Any], reason: str) -> None:
+def test_a_wb_mqtt_text_with_unknown_character_order_is_reported(
+    tmp_path: Path, keys: dict[str, Any], reason: str
+) -> None:
     with pytest.raises(ValueError, match=f"a: {reason}"):
         channel(tmp_path, string_data_size=8, **keys)
 

@@ -83,7 +83,7 @@ def test_read_plan_does_not_depend_on_order_or_repetition_of_registers() -> None
 
 
 def test_a_write_only_register_in_a_read_plan_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"run of .* cannot be read: it is a command"):
+    with pytest.raises(ValueError, match=r"run of .* cannot be read: it is declared as a command"):
         blocks(Example(1), [Example.run])
 
 

@@ -379,7 +379,7 @@ def broken() -> dict[str, tuple[Plant, str]]:
         ),
         "not readable": (
             plant(yard(*fans(0.5)), hall(polled(Toy(1, name="pump-1"), (*ALL, Toy.control), 0.1), other)),
-            'line "hall", drive "pump-1": control of pump-1 cannot be read: it is a command',
+            'line "hall", drive "pump-1": control of pump-1 cannot be read: it is declared as a command',
         ),
     }
 

@@ -102,7 +102,7 @@ def test_repeated_reads_of_the_same_registers_are_planned_once(bus: Bus, counted
     assert counted.since() == (1, 2)
     assert [one.read_many(WANTED) for _ in range(5)] == 5 * [first]
     assert counted.since() == (0, 0)
-    one.read(Toy.acceleration_time)  # a new plan, but an earlier read created its exchange
+    one.read(Toy.acceleration_time)  # a new plan whose exchange exists since an earlier read
     assert counted.since() == (1, 0)
     other.read_many(WANTED)
     assert counted.since() == (1, 2)
@@ -274,7 +274,7 @@ def test_a_short_reply_gives_the_values_whose_bytes_are_complete(data: bytes) ->
     assert found["fine"] is None
 
 
-def test_the_core_decodes_floats() -> None:
+def test_values_that_need_exact_arithmetic_are_decoded_in_python() -> None:
     assert set(decoder().names) == {one.name for one in REGISTERS} - {"pulses", "drift", "flow", "fine"}
 
 
@@ -327,12 +327,12 @@ def test_the_error_for_a_refused_request_names_the_refused_register() -> None:
 
 
 @given(st.sets(st.integers(0, 5), max_size=2), st.integers(1, 6), st.sets(st.integers(0, 5), min_size=1))
-def test_a_read_is_whole_or_names_the_refused_register(refused: set[int], most: int, asked: set[int]) -> None:
+def test_a_failed_read_reports_a_refused_register(refused: set[int], most: int, asked: set[int]) -> None:
     drive = family(6)(1, name="pump-1")
     bus = SimulatedBus(Picky(drive, refused, most)).bus
     bus.attach(drive)
     registers = [drive.register(f"r{at}") for at in sorted(asked)]
-    for _ in range(2):  # the second read knows the smaller blocks of the first
+    for _ in range(2):  # the second read starts with the smaller blocks that the first one has found
         if not refused & asked:
             assert drive.read_many(registers) == expected_values(asked)
             continue
@@ -430,7 +430,7 @@ def test_read_raw_is_not_treated_as_a_write(simulated: SimulatedBus, toy: Drive,
     assert list(read_audit(tmp_path / "audit.jsonl")) == []
 
 
-def test_read_raw_raises_drive_exception_for_an_exception(simulated: SimulatedBus, toy: Drive) -> None:
+def test_an_exception_reply_to_a_raw_read_raises_an_error(simulated: SimulatedBus, toy: Drive) -> None:
     with pytest.raises(DriveException) as refusal:
         toy.read_raw(3, 0x4000, 1)
     assert refusal.value.code == 2

@@ -1,8 +1,8 @@
 """A late reply is never taken for the reply to another request.
 
-If a late reply could be mistaken for a request's reply, the core sends a distinctive read first. A read is
-distinctive (`proof` in the code) if no late reply can resemble its reply. The last tests reopen a port to
-which late replies come, in this process or after another one.
+If a late reply could be mistaken for a request's reply, the core sends a probe first. A probe (`proof` in the
+code) is a read whose reply no late reply can resemble. The last tests reopen a port to which late replies
+come, in this process or after another one.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ AGAIN = Message(1, 6, 9, data=words(1))
 
 @pytest.fixture
 def proof(line: LineDriver, drive: Peer) -> Exchange:
-    """Let READ time out, and the time for its late reply pass. Return a distinctive (longer) read."""
+    """Let READ time out, and the time for its late reply pass. Return a probe, which reads more registers."""
     found = exchange(LONGER, drive)
     drive.prove_by([found])
     time_out(line, drive, READ)
@@ -71,7 +71,7 @@ def test_a_write_waits_for_the_reply_to_an_earlier_write(line: LineDriver, drive
 
 
 @pytest.mark.parametrize("late", [0, 1])
-def test_a_distinctive_reply_ends_the_wait_for_late_replies(
+def test_an_answered_probe_ends_the_wait_for_late_replies(
     line: LineDriver, drive: Peer, proof: Exchange, late: int
 ) -> None:
     line.send(proof)
@@ -84,7 +84,7 @@ def test_a_distinctive_reply_ends_the_wait_for_late_replies(
     assert line.data_after(reply(2222)) == words(2222)
 
 
-def test_requests_still_wait_after_an_unanswered_distinctive_read(
+def test_requests_still_wait_if_a_probe_for_late_replies_is_unanswered(
     line: LineDriver, drive: Peer, proof: Exchange
 ) -> None:
     line.send(proof)
@@ -95,7 +95,7 @@ def test_requests_still_wait_after_an_unanswered_distinctive_read(
 
 
 def ask_in_vain(line: LineDriver, drive: Peer, proof: Exchange) -> None:
-    """Let the drive answer another request, but neither READ nor the distinctive read."""
+    """Let the drive answer another request, but neither READ nor the probe."""
     ask(line, drive, Message(1, 4, 50, 1))
     line.receive(build_reply(Framing.RTU, Message(1, 4, data=words(2222))))
     assert line.completion.result > 0
@@ -106,7 +106,7 @@ def ask_in_vain(line: LineDriver, drive: Peer, proof: Exchange) -> None:
     line.now = drive.late_until_ns + MS
 
 
-def test_requests_are_sent_again_if_distinctive_reads_get_no_reply(
+def test_requests_no_longer_wait_after_two_unanswered_probes(
     line: LineDriver, drive: Peer, proof: Exchange
 ) -> None:
     """Some devices do not reply to reads of registers that they do not have."""
@@ -117,7 +117,7 @@ def test_requests_are_sent_again_if_distinctive_reads_get_no_reply(
 
 
 @pytest.mark.parametrize("is_late", [True, False])
-def test_a_distinctive_read_stays_in_use_once_it_was_answered(
+def test_requests_wait_for_a_probe_that_the_drive_has_answered_before(
     line: LineDriver, drive: Peer, proof: Exchange, is_late: bool
 ) -> None:
     if is_late:
@@ -130,7 +130,7 @@ def test_a_distinctive_read_stays_in_use_once_it_was_answered(
     assert is_barred(line, drive, OTHER)
 
 
-def test_a_distinctive_read_stays_in_use_while_the_drive_is_silent(
+def test_requests_wait_for_a_probe_while_the_drive_is_silent(
     line: LineDriver, drive: Peer, proof: Exchange
 ) -> None:
     for _ in range(3):
@@ -141,7 +141,7 @@ def test_a_distinctive_read_stays_in_use_while_the_drive_is_silent(
 
 
 @pytest.mark.usefixtures("proof")
-def test_a_stop_is_sent_without_a_distinctive_read(line: LineDriver, drive: Peer) -> None:
+def test_a_stop_is_sent_without_a_probe_for_late_replies(line: LineDriver, drive: Peer) -> None:
     time_out(line, drive, WRITE)
     stop = exchange(AGAIN, drive)
     stop.c.insists = 1
@@ -204,7 +204,7 @@ def has_sure_reply(line: LineDriver, drive: Peer) -> bool:
     return bool(line._line.is_answered)
 
 
-def test_a_reply_is_in_doubt_if_it_may_answer_another_request(line: LineDriver, drive: Peer) -> None:
+def test_a_reply_is_not_trusted_if_it_may_answer_another_request(line: LineDriver, drive: Peer) -> None:
     assert has_sure_reply(line, drive)
     line.receive(b"\xff")  # a byte that may belong to another master's request
     assert not has_sure_reply(line, drive)
@@ -215,7 +215,7 @@ def test_a_reply_is_in_doubt_if_it_may_answer_another_request(line: LineDriver, 
 
 
 @pytest.mark.usefixtures("proof")
-def test_the_next_reply_is_certain_after_a_distinctive_read(
+def test_a_reply_after_an_answered_probe_cannot_be_late(
     line: LineDriver, drive: Peer, proof: Exchange
 ) -> None:
     line.send(proof)
@@ -225,7 +225,7 @@ def test_the_next_reply_is_certain_after_a_distinctive_read(
 
 @pytest.fixture
 def first(drive: Peer) -> Exchange:
-    """Return the distinctive read of a drive whose first reply may answer another process's READ."""
+    """Return the probe of a drive whose first reply may answer another process's READ."""
     found = exchange(LONGER, drive)
     drive.prove_by([found, exchange(Message(1, 3, 0, 3), drive)])
     drive.doubt_first_reply()
@@ -236,9 +236,7 @@ def is_in_doubt(line: LineDriver) -> bool:
     return line.want == "done" and line.completion.result == Failure.LATE_ANSWER_DUE
 
 
-def test_replies_are_accepted_once_a_distinctive_read_is_answered(
-    line: LineDriver, drive: Peer, first: Exchange
-) -> None:
+def test_replies_are_accepted_after_an_answered_probe(line: LineDriver, drive: Peer, first: Exchange) -> None:
     ask(line, drive, READ)
     line.receive(reply(7777))  # the reply to another process's READ
     assert is_in_doubt(line)
@@ -251,7 +249,7 @@ def test_replies_are_accepted_once_a_distinctive_read_is_answered(
     assert drive.counters().late == 0  # this drive has answered each request in time
 
 
-def test_the_next_reply_is_in_doubt_if_the_first_was_an_exception(
+def test_a_reply_may_be_late_if_the_first_reply_was_an_exception(
     line: LineDriver, drive: Peer, first: Exchange
 ) -> None:
     ask(line, drive, READ)
@@ -272,7 +270,7 @@ def test_the_first_write_is_sent_only_after_a_reply_to_a_read(line: LineDriver, 
 
 
 @pytest.mark.usefixtures("first")
-def test_a_stop_accepts_a_first_reply_that_is_in_doubt(line: LineDriver, drive: Peer) -> None:
+def test_a_stop_accepts_a_first_reply_that_may_be_late(line: LineDriver, drive: Peer) -> None:
     for request, came in ((READ, reply(1)), (WRITE, build_reply(Framing.RTU, WRITE))):
         asked = exchange(request, drive)
         asked.c.insists = 1
@@ -281,7 +279,7 @@ def test_a_stop_accepts_a_first_reply_that_is_in_doubt(line: LineDriver, drive: 
         assert line.completion.result > 0
 
 
-def test_the_first_reply_is_accepted_if_no_read_is_distinctive(line: LineDriver, drive: Peer) -> None:
+def test_the_first_reply_is_accepted_if_the_drive_has_no_probe(line: LineDriver, drive: Peer) -> None:
     drive.doubt_first_reply()
     ask(line, drive, READ)
     assert line.data_after(reply(1111)) == words(1111)

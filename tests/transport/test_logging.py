@@ -41,7 +41,9 @@ def test_opening_and_closing_a_port_is_logged(caplog: pytest.LogCaptureFixture) 
     assert told == [("INFO", f"{port}: opened ({port})"), ("INFO", f"{port}: closed")]
 
 
-def test_a_port_that_was_never_open_is_not_logged(caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
+def test_a_port_that_cannot_be_opened_is_logged_as_not_opened(
+    caplog: pytest.LogCaptureFixture, tmp_path: Path
+) -> None:
     with caplog.at_level(logging.INFO, "multidrop"):
         bus = Bus.awaiting(str(tmp_path / "port"))
         with pytest.raises(LineError):

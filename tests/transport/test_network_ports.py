@@ -123,7 +123,8 @@ def flooding() -> Iterator[tuple[str, threading.Event]]:
             while received := client.recv(1024):
                 b"".join(far.filter(received))
                 purges += received.count(rfc2217.COM_PORT_OPTION + rfc2217.PURGE_DATA)
-                if purges == 2 and not floods.ident:  # the client has opened the port at its second purge
+                # the client sends its second purge when it has opened the port
+                if purges == 2 and not floods.ident:
                     floods.start()
         client.close()
         floods.join()

@@ -129,14 +129,14 @@ def test_a_port_is_reopened_only_with_the_same_adapter(
 @table(
     ("before", "now", "others", "is_found"),
     [
-        (("1-1", "A1"), ("1-1", "A1"), [], True),  # the same adapter, renamed to ttyUSB1 after a sleep
+        (("1-1", "A1"), ("1-1", "A1"), [], True),  # the same adapter in the same socket
         (("1-1", "A1"), ("1-1", "A1"), [("1-2", "A1")], True),  # another adapter has the same serial number
         # in another USB socket: this may be another adapter with the same serial number
         (("1-1", "A1"), ("1-2", "A1"), [], False),
         (("1-1", "A1"), ("1-2", "A1"), [("1-1", "B2")], False),
         (("1-1", ""), ("1-1", ""), [("1-2", "")], True),
         (("1-1", ""), ("1-2", ""), [], False),
-        # two adapters with the same serial number are plugged in, both in other USB sockets
+        # two adapters with the known serial number, but neither of them in the old USB socket
         (("1-1", "A1"), ("1-2", "A1"), [("1-3", "A1")], False),
     ],
 )
@@ -204,7 +204,7 @@ def test_a_new_pseudo_terminal_with_a_used_number_is_not_opened(tmp_path: Path, 
                 stack.callback(os.close, end)
         if is_replaced:
             link.unlink()
-            link.symlink_to(later[-1])  # the new pseudo-terminal usually has the number of the closed one
+            link.symlink_to(later[-1])  # usually `device`, whose return ends the loop
             found.reopen()
             found.close()
         else:
@@ -335,7 +335,7 @@ def all_descriptors_in_use() -> Iterator[None]:
             os.close(fd)
 
 
-def test_closing_a_stalled_port_takes_limited_time_without_free_descriptors(
+def test_a_stalled_port_closes_in_time_if_no_descriptor_is_free(
     terminal: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """If pyserial closed the port itself, it would wait for the adapter for up to 30 s."""
@@ -438,7 +438,9 @@ def test_the_error_for_a_silent_drive_behind_a_stalled_adapter_names_the_stall(
             toy.read(toy.output_current)
 
 
-def test_an_unsent_read_does_not_lose_a_stalled_port(terminal: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stalled_port_stays_open_after_an_unsent_read(
+    terminal: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     held = SimpleNamespace(count=-1, result=Failure.STALLED, error=errno.ETIMEDOUT, raw=b"", reply=None)
     with Bus(terminal) as bus:
         toy = bus.attach(Toy, 1)

@@ -142,7 +142,7 @@ def test_tcp_framing_on_a_serial_port_raises_a_one_sentence_error(drive: Drive, 
         bus.attach(drive)
 
 
-def test_unit_ids_that_only_modbus_tcp_allows_raise_on_other_ports() -> None:
+def test_unit_ids_of_modbus_tcp_are_refused_on_serial_ports() -> None:
     class Both(Drive):
         title = "Both"
         addresses = range(256)

@@ -19,7 +19,8 @@ from bench.support.tables import heading, show
 from multidrop.importers import SUFFIXES, ImportedDevice, all_devices
 
 MOST_SHOWN = 15  # limit of remarks in the report
-# A number or a name in a reason: reasons that differ only in these count together.
+# Matches numbers and register names in error sentences, so that sentences that differ only there are counted
+# together.
 _DETAIL = re.compile(r"\b((?<=scale register )\w+|0x[0-9a-fA-F]+|[0-9A-F]{4}H|\d+)\b")
 
 
@@ -45,7 +46,8 @@ class Coverage:
 
     def __init__(self, devices: Iterable[ImportedDevice]) -> None:
         self.by_device = [(device, holdings(device)) for device in devices]
-        # numbers of devices by reason: a family can declare each of their entries, but not all in one class
+        # devices whose entries can be declared one by one, but not together in one class: their number, by
+        # reason
         self.refused = Counter[str]()
         self.whole = sum(self._is_whole(entries) for _, entries in self.by_device)
 
@@ -62,7 +64,7 @@ class Coverage:
         return [entry for _, entries in self.by_device for entry in entries]
 
     def needed(self) -> Iterator[tuple[str, int, int]]:
-        """Yield each detail in words, how many entries have it, and how many of these can be declared."""
+        """Yield each detail's title, the number of entries with it, and how many of these can be declared."""
         for key, words in DETAILS.items():
             needing = [entry for entry in self.entries if key in entry.details]
             yield words, len(needing), sum(entry.is_whole for entry in needing)
@@ -96,7 +98,7 @@ def _lack(entry: Holding) -> str:
 
 
 def report(coverage: Coverage, unread: list[str]) -> None:
-    """Print how many entries and devices can be declared, which details they need, and why others fail."""
+    """Print how many entries and devices can be declared, and why the library rejects the others."""
     entries, devices = coverage.entries, len(coverage.by_device)
     held = sum(entry.is_whole for entry in entries)
     readable = sum(entry.is_held for entry in entries)

@@ -39,7 +39,7 @@ from multidrop.recording.segments import SegmentWriter
 SECOND = 1_000_000_000
 SEGMENT_S = 600
 MIDNIGHT = 1_795_219_200 * SECOND  # 2026-11-21
-FULL_S = 3600  # seconds after midnight until which a register has 10 rows per second, then one
+FULL_S = 3600  # seconds after midnight with 10 rows per second and register; later there is one row
 DRIVES, REGISTERS = 31, 10
 UNIT = "Hz"
 DESCRIBED = {f"value_{number}": {"unit": UNIT} for number in range(REGISTERS)}
@@ -91,7 +91,7 @@ def make_day(folder: Path, hours: int) -> None:
             f"a segment of {SEGMENT_S} s: {size / 1e6:.1f} MB as .arrows; compacted by a process with",
             end=" ",
         )
-        # a small process starts the compaction, and measures the greatest memory of this child alone
+        # The compaction runs as the only child of a small process, which measures its greatest memory.
         words = [sys.executable, "-c", COMPACTED, str(folder)]
         print(subprocess.run(words, check=True, capture_output=True, text=True).stdout.strip())
         segments = hours * 3600 // SEGMENT_S

@@ -36,7 +36,7 @@ ROOT = Path(__file__).parents[3]
 GATEWAYS = ("gateway-1", "gateway-2")
 PATIENCE_S = 300.0  # longest wait after the last kill until every sample is stored
 
-Numbers = dict[str, Counter[int]]  # gateway: how many copies of each exchange are stored
+Numbers = dict[str, Counter[int]]  # numbers of stored copies, by gateway and exchange number
 
 
 class Process:
@@ -108,7 +108,7 @@ class Chaos:
         name, attack = self._dice.choice(attacks)
         attack()
         self.counts[name] += 1
-        self._wait(0.2, 6.0)  # an election takes 4 to 9 s
+        self._wait(0.2, 6.0)  # often shorter than an election of a NATS leader, which takes 4 to 9 s
         for hub in self.hubs:
             if hub.is_over():  # the hub has ended without an attack
                 self.counts["hub ended by itself"] += 1
@@ -213,9 +213,9 @@ def _log_of(folder: Path) -> str:
 
 
 def told(folder: Path) -> dict[str, dict[int, int]]:
-    """Return how many exchanges each gateway has reported as stored, in each of its runs.
+    """Return how many exchanges each run of a gateway has reported as stored.
 
-    The keys are the gateway and the number of the run's first exchange.
+    The outer key is the gateway's name. The inner key is the number of the run's first exchange.
     """
     found: dict[str, dict[int, int]] = {}
     for name in GATEWAYS:

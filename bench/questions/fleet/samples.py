@@ -223,7 +223,8 @@ def size_of(folder: Path) -> int:
 def timed(rows: int, act: Callable[[], int]) -> tuple[str, str, str]:
     """Run `act`, which writes `rows` rows and returns the bytes on disk.
 
-    Return millions of rows per second; per row, the CPU time of this process in ns, and the bytes on disk.
+    Return three figures: millions of rows per second, ns of CPU time per row in this process, and bytes on
+    disk per row.
     """
     begun, used = time.monotonic(), cpu()
     size = act()

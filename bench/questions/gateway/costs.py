@@ -80,7 +80,10 @@ class FakeTransport(asyncio.Transport):
 
 
 class Worker:
-    """Does each kind of a gateway's work once for all drives; the gateway itself is not started."""
+    """The separate tasks of a gateway; each call carries out one task once for all drives.
+
+    The gateway itself is not started.
+    """
 
     def __init__(self, folder: Path, lines: tuple[int, ...] = LINES) -> None:
         self.plant = Plant.load(write_plant(folder, lines))
@@ -173,7 +176,7 @@ class Worker:
         return read
 
     def viewer(self) -> Callable[[], Any]:
-        """Return a function that requests, over HTTP, a frame that is available."""
+        """Return a function that requests the web page's newest data over HTTP."""
         from uvicorn import Config
         from uvicorn.protocols.http.h11_impl import H11Protocol
         from uvicorn.server import ServerState

@@ -192,7 +192,8 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=15.0)
     parser.add_argument("--stops", type=int, default=10)
     arguments = parser.parse_args()
-    sys.setswitchinterval(1e-4)  # the simulator must not wait for the tool's thread
+    # Python switches often between the threads, so that the simulator's thread is not delayed by the tool's.
+    sys.setswitchinterval(1e-4)
     size = arguments.drives, arguments.baudrate
     tables.heading("{} drives at {} bit/s, polled beside a tool that reads without pause.".format(*size))
     rows, before_stops = [], []

@@ -113,7 +113,7 @@ def instructions(lines: int, seconds: float) -> tuple[int, dict[str, Any]]:
         told = run(Job(ports, seconds), *valgrind)
         summary = re.search(r"^summary: (\d+)", out.read_text(), re.MULTILINE)
         if not summary:
-            raise RuntimeError("valgrind reports no count")
+            raise RuntimeError("valgrind has not reported the number of instructions")
         return int(summary[1]), told
 
 

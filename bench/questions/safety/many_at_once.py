@@ -58,7 +58,7 @@ def plant(ports: Sequence[str], drives: int) -> Plant:
 
 
 def wires(lines: int, drives: int) -> list[Wire]:
-    """Return simulated lines that do not wait as long as a serial line does: the computer is too busy."""
+    """Return simulated lines without the delays of a serial line, which this busy computer could not keep."""
     return [
         Wire(
             [
@@ -150,7 +150,7 @@ class Round:
         self.count(moved=1)
 
     def command(self, chance: random.Random) -> None:
-        """Command a motor, at most one thread at a time: another start would prolong the wait of a stop."""
+        """Command a motor unless another thread does so: another start would delay the end of a stop."""
         line = chance.choice(self.plant.lines)
         if self._panels[line.name].acquire(blocking=False):
             try:

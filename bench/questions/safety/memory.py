@@ -22,7 +22,7 @@ from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.settings import ServeSettings, read_settings
 from multidrop.sim import Simulator, Wire, simulated
 
-WARM_UP = 0.02  # part of all exchanges; afterwards the buffers no longer grow
+WARM_UP = 0.02  # fraction of all exchanges during which the buffers may still grow
 ROWS = 10
 DRIVES = 40
 

@@ -36,7 +36,7 @@ from multidrop.sim import load_faults
 from multidrop.toml_check import parse_duration
 
 PLAYERS = Path(__file__).parents[2] / "players"
-MOST_GROWTH_KB = 2048  # limit for resident memory after the first period
+MOST_GROWTH_KB = 2048  # limit of the growth of resident memory since the end of the first period
 COMMAND_EVERY = 20.0  # s between the start and the stop of a motor
 IN_FLIGHT = 2  # number of each register's newest reads that may have no row yet
 HELD_UP = 1.0  # s; a wrong value is excused if the simulator was late within this time before the value
@@ -182,12 +182,12 @@ class Soak:
         return period
 
     def unexplained(self, overrun: int) -> int:
-        """Return how many due values have no row; the poller has skipped another `overrun` values."""
+        """Return how many due values have no row, not counting the `overrun` values that were skipped."""
         slots = int((time.monotonic() - self.begun) / plants.EVERY) - IN_FLIGHT
         return max(0, sum(max(0, slots - self.slots[key]) for key in self.timed) - overrun)
 
     def periods(self, hours: float, every: float, commander: Commander) -> Iterator[Period]:
-        """Poll for `hours`; at the end of each period of `every` s, print its row and yield it."""
+        """Poll for `hours`. After each period of `every` s, print and yield the period's figures."""
         print("  ".join(HEAD), flush=True)
         end = self.begun + hours * 3600
         while (left := end - time.monotonic()) > 1:

@@ -37,7 +37,7 @@ REFUSALS: dict[str, tuple[int, ...]] = {  # exception codes that answer a stop's
 MOST_READS = 8  # limit of the reads that a start makes before its write
 LATE, PATIENCE = 0.6, 3.0  # s: delay that makes replies too late to confirm a stop; limit for a stop
 CUT_SHORT = "cut short"  # printed by a client if a third signal cuts its stops short
-PAUSE = 2.5  # s; longer than the expiry of a start, and than each of its reads
+PAUSE = 2.5  # s of suspension; a start and its reads expire sooner
 Attack = Callable[[random.Random, int, bool], Counters]
 
 
@@ -46,10 +46,10 @@ def _in_turn(chance: random.Random) -> Iterator[str]:
 
 
 def signals(number: int, leaving: bool) -> Attack:
-    """Return an attack by `number` signals at random moments.
+    """Return a test that sends `number` signals to a client at random moments, while its motors turn.
 
-    The signals reach a client that is exiting (with `leaving`), or one that is idle. If a client gets three
-    signals and reports that its stops were aborted, a motor that still turns is not counted as a failure.
+    With `leaving`, the client is already exiting; otherwise it is idle. If a client gets three signals and
+    reports that its stops were aborted, a motor that still turns is not counted as a failure.
     """
 
     def attack(chance: random.Random, rounds: int, is_long: bool) -> Counters:
@@ -127,7 +127,7 @@ def deaf(chance: random.Random, rounds: int, is_long: bool) -> Counters:
 
 
 def two_lines(*, polls: bool) -> Attack:
-    """Return an attack: a signal ends the program, which must stop the slow motors of both its lines."""
+    """Return a test that ends a client by a signal: it must stop the slow motors of both its lines."""
 
     def attack(chance: random.Random, rounds: int, is_long: bool) -> Counters:
         counters = Counters()
@@ -144,7 +144,7 @@ def two_lines(*, polls: bool) -> Attack:
 
 
 def failing_reads(chance: random.Random, rounds: int, is_long: bool) -> Counters:
-    """Stop a drive that replies to the first reads with an exception, or 0.6 s late to every request."""
+    """Stop a drive that refuses the first reads, then a drive that replies to each request 0.6 s late."""
     counters = Counters()
     for _ in range(rounds):
         for kind, codes in REFUSALS.items():

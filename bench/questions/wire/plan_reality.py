@@ -88,7 +88,7 @@ def case(name: str, port: str, wanted: Wanted, seconds: float) -> Case:
 
 
 def middle(times: Sequence[int]) -> float:
-    """Return the usual period in s between times in ns: the median of the mean periods of each second."""
+    """Return the usual period of times in ns, as seconds: the median of the means of all seconds."""
     most = len(times) - 1
     step = min(most, max(1, round(1e9 * most / (times[-1] - times[0]))))
     return median(times[at + step] - times[at] for at in range(0, most - step + 1, step)) / step / 1e9

@@ -36,7 +36,7 @@ poll = ["output_frequency", "output_current", "fault"]
 
 
 def _play(plant: Path, pipe: Connection) -> None:
-    """Simulate the plant until a message comes; then send each setpoint's time, in s of CLOCK_MONOTONIC."""
+    """Simulate the plant until a message arrives; then send the times of all setpoint writes, in s."""
     line = Plant.load(plant).lines[0]
     sims = [simulated(polled.drive) for polled in line.drives]
     for sim in sims:

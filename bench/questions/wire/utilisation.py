@@ -24,7 +24,8 @@ from bench.support.programs import busy_loops, paced_line
 BARE = "bare C"
 QUIET = "multidrop, quiet"  # name of the row for multidrop without busy loops
 BARE_REALTIME = "bare C, realtime"
-TCP_START_MS = 1500  # start of a run, not counted: a new connection delays single bytes
+# A new TCP connection delays some bytes, so requests at the start of a run are not counted.
+TCP_START_MS = 1500
 # minimal C master that sleeps until 1.5 characters before a reply's end, as multidrop does
 ASLEEP = "bare C, asleep"
 BESIDE = (BARE, BARE_REALTIME, "multidrop", "multidrop, realtime", "pymodbus", "minimalmodbus")

@@ -111,9 +111,9 @@ class Decoder:
         return Framing(self._c.span.framing), from_c(self._c.span.message)
 
     def know(self, block: RowLayout | None) -> bool:
-        """Store the layout of the replies to the request in `asked`; return False if the table is full.
+        """Store the layout of the replies to the request that `asked` returns.
 
-        If `block` is None, the replies to this request make no rows.
+        Replies without a layout (None) make no rows. Return False if the table of layouts is full.
         """
         if block:
             self._blocks.append(block)
@@ -180,7 +180,10 @@ class Unpacker:
         self._c.at = at - self._begin
 
     def add_channel(self, link: int, *, has_sides: bool, ticks_per_s: int, offset_ns: int) -> None:
-        """Add the next interface of the file. If `has_sides`, its packets name their senders."""
+        """Add the capture file's next interface: one recorded line.
+
+        `has_sides` is True if each packet states which side sent it.
+        """
         channel = self._channels[self._c.count]
         channel.link, channel.has_sides = link, has_sides
         channel.ticks_per_s, channel.offset_ns = ticks_per_s, offset_ns
@@ -188,7 +191,7 @@ class Unpacker:
         self._c.count += 1
 
     def unpack(self) -> Unpacked:
-        """Append packets to their channels' streams until the caller must act; return the reason."""
+        """Append packets to the streams of their channels; return why unpacking stopped."""
         return Unpacked(lib.md_unpack(self._c))
 
 

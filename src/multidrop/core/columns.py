@@ -135,7 +135,7 @@ class Extra(NamedTuple):
     low: int = 0  # index of the field's lowest bit within the raw number
     bits: int = 0  # number of the field's bits; 0: all bits of the raw number
     scale_at: int | None = None  # index in the reply of the 16-bit word with the decimal exponent
-    scale_format: int = NumberFormat.I16  # format of the exponent, whose low 16 bits are a signed number
+    scale_format: int = NumberFormat.I16  # format of that word; the exponent is always read as signed
     invalid: tuple[tuple[int, int], ...] = ()  # pairs of mask and bit pattern that mean "no value"
     scale_invalid: tuple[tuple[int, int], ...] = ()
 
@@ -272,7 +272,7 @@ class Columns:
 
 
 class Spelling(NamedTuple):
-    """Names joined into one text, from which the core builds Arrow utf8 columns."""
+    """Names joined into one text, from which the C core builds Arrow utf8 columns."""
 
     names: int
     longest: int
@@ -362,7 +362,7 @@ class CodeTable:
             self._names = names
 
     def narrow(self, codes: memoryview[Any]) -> memoryview[Any] | None:
-        """Return the one-byte code for each two-byte code; None if the used names are too many for one byte.
+        """Return the one-byte code of each two-byte code; None if one byte cannot distinguish all used codes.
 
         Raises ValueError if a code has no name.
         """

@@ -522,7 +522,7 @@ class Exchange:
         self.peer = peer
         self.block = block
         self.values = values
-        self.room = values.count if values else 0  # number of values in a completion
+        self.room = values.count if values else 0  # number of values that its Completion must hold
         self.echo_probe = echo_probe
         self.permit = permit
         self.settings = (baudrate, format)
@@ -550,5 +550,5 @@ class Exchange:
         }
         if block is not None and block.count > 0:
             self.c, self._memory = new_beside("struct md_exchange", fields)
-        else:  # rarely used, so its place in memory does not matter
+        else:  # not polled, so its place in memory matters little
             self.c = self._memory = ffi.new("struct md_exchange *", fields)

@@ -44,7 +44,7 @@ class Latch:
         self.revoke(why)
 
     def let_go(self, stop: object) -> None:
-        """End this stop's `hold`: new permits are valid again, unless another stop is in progress."""
+        """Allow writes again after the `hold` for this stop, unless another stop is in progress."""
         self._holds.discard(stop)
 
     def permit(self, seen: int | None = None) -> Permit:
@@ -129,16 +129,18 @@ class Mastership:
 
     @property
     def holds(self) -> bool:
-        """True while the deadline has not passed."""
+        """True while this process may send: the deadline has not passed."""
         return not self._is_inherited and bool(lib.md_mastership_holds(self.c))
 
     def extend(self, until_ns: int) -> None:
         """Set the deadline to this time, unless the present deadline is later.
 
-        The kernel's timer, which kills a suspended process, is set to `guard_s / 2` seconds after the
-        deadline. After `end`, a call starts the mastership again.
+        The first call starts the mastership, and the first call after `end` starts it again. The kernel's
+        timer is set to `guard_s / 2` seconds after the deadline: if the process is suspended then, the timer
+        kills it.
 
-        Raises ValueError if the time is past, and changes nothing: the timer would kill this process now.
+        Raises ValueError for a time in the past, and changes nothing: the timer would kill this process at
+        once.
         """
         if isinstance(until_ns, bool) or not isinstance(until_ns, int):
             raise TypeError(f"until_ns is a whole number of ns of CLOCK_BOOTTIME, not {until_ns!r}")

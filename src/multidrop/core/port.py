@@ -146,7 +146,7 @@ _SWITCHES = {
 }
 
 
-NICE = -10  # nice value, under realtime scheduling, of the threads that pass on values from the core
+NICE = -10  # nice value of threads that pass on polled values, if realtime scheduling is requested
 
 
 class _Engine:
@@ -162,7 +162,7 @@ class _Engine:
         self._c: Any = None
         self._changing = threading.Lock()
         self._realtime: set[Realtime] = set()
-        self._nice: dict[int, int] = {}  # nice values, before they were lowered, of threads by native id
+        self._nice: dict[int, int] = {}  # original nice values of threads, by native thread id
 
     @property
     def c(self) -> Any:
@@ -221,9 +221,9 @@ class _Engine:
 
 
 class Realtime:
-    """A client's request that the core's thread has realtime scheduling, a priority above all normal threads.
+    """One user's wish that the C core's thread runs with realtime scheduling, before all normal threads.
 
-    The thread has realtime scheduling while any client requests it. It returns to normal scheduling by itself
+    The thread has realtime scheduling while any user requests it. It returns to normal scheduling by itself
     if it uses more than half of a processor.
     """
 
@@ -235,15 +235,16 @@ class Realtime:
         """Request realtime scheduling, or withdraw the request. Raises OSError if the system refuses."""
         if wanted != self.is_wanted:
             self.is_wanted = wanted
-            self.is_held = False  # set before the thread returns to normal scheduling: see `has_ended`
+            # Cleared first: otherwise `has_ended` could take a requested end for one by itself.
+            self.is_held = False
             _engine.set_realtime(self, wanted)
             self.is_held = wanted
 
     def lower_nice(self) -> None:
-        """If realtime scheduling was granted, let the calling thread run before most normal threads.
+        """Let the calling thread run before most normal threads, if realtime scheduling was granted.
 
-        For threads that pass on values from the core. Raises OSError if the system refuses, but only at the
-        first call of a thread.
+        Threads that pass on polled values call this. Raises OSError if the system refuses; another call from
+        the same thread then does nothing.
         """
         if self.is_held:
             _engine.lower_nice()
@@ -319,7 +320,7 @@ def refused_names(mask: int) -> str:
 
 
 def possible_rates(fd: int, baudrate: int) -> tuple[int, int, int]:
-    """Return the rate at which a UART would run instead of `baudrate`, and its nearest possible rates."""
+    """Return the rate that a UART would use for `baudrate`, and the nearest rates below and above."""
     base = int(lib.md_port_baud_base(fd))
     divisor = (base + baudrate // 2) // baudrate
     return base // divisor, base // -(-base // baudrate), base // (base // baudrate)
@@ -357,7 +358,7 @@ def set_settings(fd: int, baudrate: int, format: str) -> int:
 
 
 class _PortMemory:
-    """All memory of Python objects that the core's thread reads or writes for one port.
+    """All memory of Python objects that the C core's thread reads or writes for one port.
 
     Store an object here before passing it to the core.
     """
@@ -499,9 +500,10 @@ class Port:
     close = stop
 
     def report_to(self, row_queue: RowQueue, number: int) -> None:
-        """Deliver rows to `row_queue`; its `await_calls` returns `number` when the port needs attention.
+        """Deliver rows to `row_queue`, and wake its reader when the port needs attention.
 
-        The port needs attention if its queue runs low, the port is lost or has stopped repeating, or a drive
+        `row_queue.await_calls` then returns `number`. The port needs attention if few queued exchanges are
+        left, if repeated exchanges have stopped, or if the port is lost. It also needs attention if a drive
         refuses a request, does not answer, or answers again.
         """
         with self._memory.replacing("rows", row_queue):

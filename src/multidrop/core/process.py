@@ -147,8 +147,8 @@ class AsideThread:
     def forked(self) -> None:
         self._work: SimpleQueue[Callable[[], object]] = SimpleQueue()
         self._begun = threading.Lock()  # locked once the thread was started, by the first `put`
-        # A queue and the timeout in s of the newest `flush` that timed out; None if none did. The queue is
-        # empty until the work that was waiting at that `flush` is done.
+        # The newest `flush` that timed out: a queue that is empty until all work before this `flush` is done,
+        # and the timeout in s. None if no `flush` has timed out.
         self._late: tuple[SimpleQueue[None], float] | None = None
 
     def put(self, work: Callable[[], object], most: int = MOST_WAITING) -> None:

@@ -184,7 +184,7 @@ def fact_errors(family: Any) -> list[str]:
                 wrong["options"] = (
                     f"options[{name!r}]: span = {option.span!r} is not the smallest and the largest value"
                 )
-    # a register with the name of an attribute is reported as a reserved name
+    # A register that replaces such an attribute is reported elsewhere: its name is reserved.
     registers = {*family.registers, *family.texts}
     return [sentence for name, sentence in wrong.items() if name not in registers]
 
@@ -308,7 +308,7 @@ def _fits_table(register: Register[Any]) -> bool:
     return register.number_format is wanted
 
 
-# Number formats whose bits a register may use only in part.
+# Number formats of which a register may use only some of the bits.
 _PARTED = frozenset(
     {
         *(NumberFormat.U16, NumberFormat.U32, NumberFormat.U64),

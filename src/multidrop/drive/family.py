@@ -60,7 +60,7 @@ class Drive(RegisterAccess):
 
     title: ClassVar[str] = ""
     model: ClassVar[str] = ""
-    declared_in: ClassVar[str] = ""  # name of the family's TOML file; such families are untested
+    declared_in: ClassVar[str] = ""  # name of the TOML file that declares the family, which is untested
     manual: ClassVar[str] = ""
 
     # ---- the line ----
@@ -91,7 +91,7 @@ class Drive(RegisterAccess):
 
     # limit of registers in one read, by table; default: the Modbus limit
     most_registers: ClassVar[Mapping[Table, int]] = {}
-    # addresses without a register that one read may include, by table
+    # by table: addresses that one read may include, although some of them have no register
     readable_gaps: ClassVar[Mapping[Table, range]] = {}
     # groups of registers that one request must read, in this order
     read_together: ClassVar[tuple[tuple[str, ...], ...]] = ()
@@ -332,7 +332,7 @@ class Drive(RegisterAccess):
 
     @property
     def identity_is_weak(self) -> bool:
-        """True if `identify` may accept another make; then commands also check `families.makes`."""
+        """True if a drive of another make may pass `identify`; then commands need more checks."""
         return False
 
     @property
@@ -365,7 +365,7 @@ class Drive(RegisterAccess):
             return
         if why := doubt(self._kind(), self.declared_in, identifies=self._identifies()):
             raise WriteForbidden(
-                f"{what} is not sent to {self.name}: {why}, and declare confirmed = 1",
+                f"{what} is not sent to {self.name}: {why}; then declare confirmed = 1",
                 rule="the drive is not confirmed",
                 advice=Advice.declare("confirmed", 1),
             )
@@ -483,7 +483,10 @@ class Drive(RegisterAccess):
 
     @verb
     def identify(self) -> Script[None]:
-        """Read registers; raise WriteForbidden if their values show a drive of another family."""
+        """Check that the drive is of this family, if it has registers that show this.
+
+        Raises WriteForbidden if their values show another family.
+        """
         yield from ()
 
     def resembles(self) -> Script[bool]:
@@ -493,50 +496,56 @@ class Drive(RegisterAccess):
 
     @verb
     def start(self, direction: Direction | None = None) -> Script[None]:
-        """Start the motor at the present setpoint, and in the present direction unless one is given."""
+        """Start the motor at the present setpoint, and in the present direction unless one is given.
+
+        Raises Unsupported if the family has no such command.
+        """
         raise self._unsupported("start command")
         yield
 
     @verb
     def stop(self) -> Script[None]:
-        """Stop the motor along its deceleration ramp."""
+        """Stop the motor along its deceleration ramp, if the family has a stop command."""
         raise self._unsupported("stop command")
         yield
 
     @verb
     def coast(self) -> Script[None]:
-        """Remove the voltage and let the motor coast."""
+        """Remove the voltage and let the motor coast, if the family has such a command."""
         raise self._unsupported("coast command")
         yield
 
     @verb
     def emergency_stop(self) -> Script[None]:
-        """Stop the motor with the drive's own emergency stop."""
+        """Stop the motor with the drive's own emergency stop, if it has one."""
         raise self._unsupported("emergency stop")
         yield
 
     @verb
     def jog(self, direction: Direction | None = None) -> Script[None]:
-        """Turn the motor slowly until a stop is called."""
+        """Turn the motor slowly until a stop is called, if the family has such a command."""
         raise self._unsupported("jog command")
         yield
 
     @verb
     def reset_fault(self) -> Script[None]:
-        """Reset a fault; never starts the motor."""
+        """Reset a fault, if the family has such a command. This never starts the motor."""
         raise self._unsupported("fault reset")
         yield
 
     @verb
     def set_frequency(self, hz: float) -> Script[None]:
-        """Write the frequency setpoint in Hz."""
+        """Write the frequency setpoint in Hz, if the family has one."""
         raise self._unsupported("frequency setpoint")
         yield
 
     @verb
     def release_control(self) -> Script[None]:
-        """Return control of the motor to the drive's panel or terminals; allowed only at rest."""
-        raise self._unsupported("command that returns control")
+        """Return control of the motor to the drive's panel or terminals, if the family has such a command.
+
+        This is allowed only at rest.
+        """
+        raise self._unsupported("release_control command")
         yield
 
     @verb
@@ -586,7 +595,8 @@ def check_own(drive: Drive, register: Register[Any]) -> None:
 def check_readable(drive: Drive, register: Register[Any]) -> None:
     """Raise ValueError if the register cannot be read."""
     if not register.readable:
-        raise ValueError(f"{register.name} of {drive.name} cannot be read: it is a {register.access.value}")
+        kind = register.access.value
+        raise ValueError(f"{register.name} of {drive.name} cannot be read: it is declared as a {kind}")
 
 
 def check_own_text(drive: Drive, text: Text) -> None:

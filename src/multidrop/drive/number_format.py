@@ -215,10 +215,10 @@ class Coding:
 
     @cached_property
     def invalid_patterns(self) -> tuple[tuple[int, int], ...]:
-        """Mask and bit pattern of each raw count that means "no value", except NaN.
+        """Pairs of mask and bit pattern: one pair for each raw count that means "no value", except NaN.
 
-        A raw count that fits into the bit range `part` is compared with these bits, a larger raw count with
-        the whole number. A raw count that the format cannot hold is a bit pattern, such as 8000H for an I16.
+        The mask selects the bits of `part` if the raw count fits into them, otherwise all bits. A raw count
+        outside the format's range is taken as a bit pattern, such as 8000H for an I16.
         """
         return tuple(self._pattern(count) for count in self.invalid if count == count)
 
@@ -244,7 +244,7 @@ class Coding:
         return None if bits is None else self.raw_of(bits)
 
     def raw_of(self, bits: int) -> float | None:
-        """Return the raw count that the bits of a number encode; None if it means "no value"."""
+        """Return the raw count of a number that was read, given its bits; None if it means "no value"."""
         if any(bits & mask == pattern for mask, pattern in self.invalid_patterns):
             return None
         if self.part is None:
@@ -275,10 +275,10 @@ class Coding:
         return nearest(count, self.number_format) if self.number_format in FLOATS else round(count)
 
     def exact_count(self, value: float) -> Fraction:
-        """Return the exact raw count of a value. A float stands for its shortest decimal: 0.3 is 3/10.
+        """Return the exact raw count of a value.
 
-        Only if the float's binary value gives a whole raw count, that count is returned, because the shortest
-        decimal of a 64-bit number may be inexact.
+        If the exact binary value of a float gives a whole raw count, this count is returned. Otherwise the
+        float stands for its shortest decimal: 0.3 is 3/10. For large 64-bit numbers that may be inexact.
         """
         count = (Fraction(value) - self.offset) / self.step
         return count if count.denominator == 1 else (Fraction(str(value)) - self.offset) / self.step

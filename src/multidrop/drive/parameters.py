@@ -49,7 +49,8 @@ class ParameterSpace:
     """The parameters of a family. A code in these fields may be a pattern, such as "P05.*"."""
 
     groups: tuple[ParameterGroup, ...] = ()  # the rule that computes an address from a code
-    # without `groups`: a regular expression that finds the code in the `place` of a declared register
+    # without `groups`: a regular expression that finds a parameter's code in the `place` of its register,
+    # which is the section of the manual
     named: str = ""
     table: Table = HOLDING
     monitors: tuple[str, ...] = ()  # codes that the drive itself changes; neither saved nor compared
@@ -60,7 +61,7 @@ class ParameterSpace:
     firmware: str = ""  # name of the register with the firmware version
 
     def codes(self, registers: Mapping[str, Register[Any]]) -> dict[str, tuple[int, Table]]:
-        """Return the address and table of each code; `registers` are those of the family."""
+        """Return the address and table of each parameter, by code; `registers` are those of the family."""
         found = {code: (at, self.table) for group in self.groups for code, at in group.codes().items()}
         if self.named:
             for register in registers.values():

@@ -44,7 +44,7 @@ class Kept(Enum):
 
 
 class Carrier(Enum):
-    """The item that a frame has for each address of a table, such as a bit or a 16-bit word."""
+    """The kind of data that a frame carries for one address, such as a bit or a 16-bit word."""
 
     BIT = "bit"
     WORD = "word"
@@ -62,7 +62,7 @@ class Table:
     read: int | None
     write: int | None
     carrier: Carrier = Carrier.WORD
-    kept: Kept = Kept.UNKNOWN  # the memory of all registers, if the function code alone determines it
+    kept: Kept = Kept.UNKNOWN  # memory that holds the values, if all addresses of the table use the same
 
     @property
     def read_space(self) -> tuple[Carrier, int | None]:
@@ -248,7 +248,7 @@ class Register(Generic[T]):
         return self.coding.value_of(raw, int(power))
 
     def value_in(self, data: bytes, at: int) -> T | None:
-        """Return the value at word (coils: bit) `at` of a reply's data; None for no value."""
+        """Return the value at index `at` of a reply's data, or None. `at` counts words, or bits for coils."""
         number = self.number_in(data, at)
         if number is None:
             return None
@@ -432,8 +432,8 @@ class Details(TypedDict, total=False):
     offset: float  #: value of the raw count 0, so that value = raw count * step + offset
     #: Raw counts that mean "no value". A bit pattern is also accepted, such as 0x8000 for an I16.
     invalid: float | tuple[float, ...]
-    #: Lowest and highest bit of a reading that is only a part of a number. An `invalid` count that does not
-    #: fit into these bits is compared with the whole number.
+    #: Lowest and highest bit of a reading that is only a part of a number. A raw count in `invalid` that does
+    #: not fit into these bits is compared with the whole number.
     part: tuple[int, int]
     #: order of the number's bytes on the wire, A the most significant: ABCD, CDAB, BADC, DCBA, AB or BA
     order: str
@@ -449,8 +449,8 @@ class Details(TypedDict, total=False):
     default: float  #: factory value
     while_running: bool  #: whether the register may be changed while the motor turns; None if not stated
     broadcast: tuple[int, ...]  #: raw counts that the document allows in a broadcast, and that are harmless
-    #: True if a write may start, stop or reset something, so that only verbs write it. The default is True
-    #: for commands, and for settings that have `harmless`.
+    #: True if a write may start, stop or reset something. Only verbs (methods such as `start`) write such a
+    #: register. The default is True for commands, and for settings with a list of `harmless` raw counts.
     moves: bool
     #: Raw counts that do not move the motor although the register can: any caller may write them at any time,
     #: and they are repeated if the reply is lost. Only verbs send other raw counts, and only once.
@@ -458,7 +458,7 @@ class Details(TypedDict, total=False):
     never: str  #: reason why the library never writes the register
     never_together: tuple[int, ...]  #: masks of bits that are never set in one write
     place: str  #: section of the manual that describes the register
-    outside: str  #: source of these attributes, if it is not the family's own document
+    outside: str  #: source of this declaration, if it is not the family's own document
     note: str  #: further information for users
     titles: Mapping[str, str]  #: titles in other languages, by the language: `{"ru": "выходной ток"}`
 

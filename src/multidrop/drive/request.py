@@ -119,7 +119,7 @@ def write_request(drive: Any, register: Register[Any], raw: float, address: int 
 
 
 def check_no_read(drive: Any, request: Message) -> None:
-    """Raise ValueError for a Modbus read, which `send_raw` could confuse with an earlier read."""
+    """Raise ValueError for a Modbus read: `send_raw` could return the late reply to an earlier read."""
     if drive.framing is not Framing.DELIXI and request.function in READS:
         asked = f"{request.function}, {request.start}, {request.count}"
         raise ValueError(

@@ -62,7 +62,7 @@ class Text:
         data = value.encode("latin-1")
         most = self.length * (1 if self.order == "B" else 2)
         if len(data) > most:
-            raise ValueError(f"{self.name} holds {most} characters, not {len(data)}")
+            raise ValueError(f"{self.name} can hold {most} characters, not {len(data)}")
         if self.order == "B":
             return b"".join(bytes((0, character)) for character in data.ljust(most, b"\0"))
         data = data.ljust(2 * self.length, b"\0")

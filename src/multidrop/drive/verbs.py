@@ -61,7 +61,7 @@ class Insist(Write):
 
 @dataclass(frozen=True)
 class Pulse(Insist):
-    """A harmless write that is sent only once in a call, such as a stop that trips the drive."""
+    """A write that stops the motor but trips the drive, so it is sent only once in a call."""
 
 
 @dataclass(frozen=True)
@@ -228,13 +228,13 @@ class UnattachedStop:
 
 
 class _BoundVerb(Generic[P, R]):
-    """A verb of one drive; calling it carries out the verb.
+    """A verb of one drive, such as `start`; calling it carries out the verb.
 
-    The call returns the script's result, or a CommandResult if that is None.
+    The call returns the result of the verb's script, or a CommandResult if the script returns None.
 
-    A stop takes `seconds`: it is repeated for that long, or until the motor is seen to be at rest. Without a
-    valid `seconds`, it is repeated for the duration of the motor's ramp, but for at least 30 s. A stop that
-    is called with wrong arguments is carried out before TypeError is raised.
+    A verb that stops the motor has the argument `seconds`: the stop is repeated for that time, or until the
+    motor is seen to be at rest. Without a valid `seconds`, it is repeated for as long as the motor's ramp
+    takes, but for at least 30 s. A stop with wrong arguments is carried out before TypeError is raised.
     """
 
     def __init__(self, name: str, drive: Drive, script: Callable[..., Script[R]]) -> None:

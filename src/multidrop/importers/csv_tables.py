@@ -80,8 +80,8 @@ GAPS = frozenset(
     }
 )
 _SPARE = frozenset(alias for key in ("name", "note", "at") for alias in COLUMNS[key])
-# Columns that may affect a register's value. A second column for the same key is one of them, because it may
-# contradict the first.
+# Names of columns that may affect a register's value. All aliases of a key are listed, because a second
+# column for the same key may contradict the first.
 _VALUE_COLUMNS = GAPS | frozenset(alias for aliases in COLUMNS.values() for alias in aliases) - _SPARE
 _KNOWN = IRRELEVANT | _VALUE_COLUMNS | _SPARE
 _NUMBER = re.compile(r"[0-9]{1,9}")
@@ -128,7 +128,7 @@ Cells = Mapping[str, str]
 def read_table(text: str, stem: str) -> list[ImportedDevice]:
     """Return the devices of a table. Raises ValueError if the table has no address column or no row."""
     if "\0" in text:
-        raise ValueError("the file has zero bytes; save it as CSV UTF-8")
+        raise ValueError("the file contains NUL bytes; save it as CSV UTF-8")
     lines = [line for line in text.splitlines() if line.strip() and not _COMMENT.match(line)]
     if not lines:
         raise ValueError("the file is empty: it has only comments")
@@ -151,7 +151,7 @@ def read_table(text: str, stem: str) -> list[ImportedDevice]:
 def _columns(rows: list[list[str]], stem: str) -> list[ImportedDevice]:
     layout = _Layout(rows)
     devices: dict[int | None, ImportedDevice] = {}
-    table = ImportedDevice(stem)  # counts the entries, whose number is limited
+    table = ImportedDevice(stem)  # all rows of the file, to count and to limit them
     unknown: set[str] = set()
     for row in rows[1:]:
         cells, further = layout.cells(row), layout.further(row)
@@ -254,7 +254,7 @@ def _row(devices: dict[int | None, ImportedDevice], cells: Cells, gaps: list[str
 
 
 def _placed(name: str, cells: Cells, tag: _Tag | None) -> ImportedRegister:
-    """Return a register at the row's address. The family file reports an ambiguous table or numbering."""
+    """Return a register at the row's address; add an ambiguous table or numbering to its `gaps`."""
     register = ImportedRegister(name, 0)
     stated = _table(register, cells)
     given = tag.address if tag else cells["at"]
@@ -303,7 +303,7 @@ def _is_number(cells: Cells) -> bool:
 
 
 def _steps(cells: Cells) -> list[tuple[str, str]]:
-    """Return the row's cells in scale columns, except scales of 1, with the names of the columns."""
+    """Return (column name, cell) for each scale that the row states, except scales of 1."""
     stated = [(key, cells.get(key, "")) for key in _STEP_COLUMNS]
     return [(key, cell) for key, cell in stated if cell and (key == "decimal" or not _is_one(cell))]
 
@@ -315,7 +315,7 @@ def _is_one(cell: str) -> bool:
 
 
 def _table(register: ImportedRegister, cells: Cells) -> str | None:
-    """Return the table that a row states, or None. The family file reports an unclear or unknown cell."""
+    """Return the table that a row states, or None; add an unclear cell to the register's `gaps`."""
     if function := cells.get("function"):
         codes = {int(code, 0) for code in re.findall(r"0x[0-9a-f]{1,4}|(?!0\d)\d{1,5}", function.lower())}
         tables = {(_FUNCTIONS | _WRITES).get(code) for code in codes}
@@ -369,7 +369,7 @@ def _fill(device: ImportedDevice, register: ImportedRegister, cells: Cells, tag:
 
 
 def _access(register: ImportedRegister, given: str) -> None:
-    """Set whether the register can be read and written. An unknown word is reported in the family file."""
+    """Set whether the register can be read and written; add an unknown word to its `gaps`."""
     words = re.sub(r"subscribe|static|only|[^a-z]", "", given.lower())
     if not given:
         return
@@ -432,7 +432,7 @@ def _number(device: ImportedDevice, register: ImportedRegister, cells: Cells, ta
 def _part(register: ImportedRegister, kind: str, cells: Cells, tag: _Tag | None) -> str:
     """Return the bits of the word that the register uses; "" for all.
 
-    A missing bit number is reported in the family file.
+    A missing bit number is added to the register's `gaps`.
     """
     if tag and tag.part:
         return tag.part
@@ -449,7 +449,7 @@ def _part(register: ImportedRegister, kind: str, cells: Cells, tag: _Tag | None)
 
 
 def _format(register: ImportedRegister, kind: str, cells: Cells) -> str | None:
-    """Return the number format of a row. A missing type or width is reported in the family file."""
+    """Return the number format of a row. Add a missing type or width to the register's `gaps`."""
     length = cells.get("length", "")
     words = int(length) if _NUMBER.fullmatch(length) else 0
     signed = _SIGNED.get(cells.get("signed", "").lower())
@@ -479,7 +479,7 @@ def _format(register: ImportedRegister, kind: str, cells: Cells) -> str | None:
 
 
 def _order(register: ImportedRegister, given: str) -> str:
-    """Return the byte order that a cell states. A missing byte order is reported in the family file."""
+    """Return the byte order that a cell states. Add a missing one to the register's `gaps`."""
     word = re.sub(r"[^a-z]|endian|first", "", given.lower())
     if not given:
         register.gaps.append("the order of its words is not stated")
@@ -543,14 +543,17 @@ _TAG = re.compile(r"([0-9]{1,6})!([0-9]{1,9})(?:[.](\d{1,6})([HLDE]?))?(?:#([A-Z
 _TAG_ORDERS = {  # The orders in Neuron's Modbus TCP page, section #ENDIAN. LL means the byte order 1,2,3,4.
     **{"L": "", "LL": "", "LB": "BADC", "BL": "CDAB", "BB": "DCBA", "B": "DCBA"}
 }
-# Byte orders of texts, by the last letter of the Neuron tag. Texts with the letter E (one character per
-# register, in the high byte) are not imported.
+# Byte orders of texts, by the last letter of the address in Neuron. Texts with the letter E (one character
+# per register, in the high byte) are not imported.
 _TAG_TEXT_ORDERS = {"": "", "H": "", "L": "BA", "D": "B"}
 
 
 @dataclass(frozen=True)
 class _Tag:
-    """The parts of a Neuron tag's address. `part` is the bit number, or the length of a text."""
+    """The address of a tag (a value) in the gateway program Neuron, such as 1!400001.3.
+
+    `part` is the number of a bit, or the length of a text.
+    """
 
     slave: int
     address: str
@@ -560,7 +563,7 @@ class _Tag:
 
 
 def _parse_tag(cell: str) -> _Tag | None:
-    """Return the parts of a Neuron tag's address; None if the cell is no such address."""
+    """Parse a tag's address in the notation of the program Neuron; return None for another cell."""
     match = _TAG.fullmatch(cell)
     if match is None:
         return None
@@ -568,7 +571,7 @@ def _parse_tag(cell: str) -> _Tag | None:
 
 
 def _tag_order(register: ImportedRegister, tag: _Tag, number: str) -> str:
-    """Return a number's byte order. The family file reports a Neuron tag that does not state it."""
+    """Return a number's byte order. If the tag does not state it, add this to the register's `gaps`."""
     if tag.order in _TAG_ORDERS:
         return _TAG_ORDERS[tag.order]
     if tag.order:

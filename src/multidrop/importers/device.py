@@ -158,32 +158,33 @@ def is_empty(value: Any) -> bool:
 
 @dataclass
 class ImportedRegister:
-    """A register with its address in requests. `gaps` are sentences about unknown properties.
+    """An imported register, with its address as in requests.
 
-    `lacks` names a property that affects the value, but that a family file cannot declare. Then only the raw
-    count is imported. A family file declares every register as read-only; `is_written` and `of_writes` are
-    only for reports.
+    `gaps` are sentences about its unknown properties; the family file lists them. `lacks` is a property that
+    affects the value, but that a family file cannot declare: only the raw count of such a register is
+    imported. A family file declares every register as read-only; `is_written` and `of_writes` are only for
+    reports.
     """
 
     name: str
     address: int
     table: str = "holding"
-    # keys of the register in the family file, in this order
+    # the register's keys and values in the family file
     details: dict[str, Any] = field(default_factory=dict)
     gaps: list[str] = field(default_factory=list)
     lacks: str = ""
     is_read: bool = True
     is_written: bool = False
-    of_writes: dict[str, Any] = field(default_factory=dict)  # keys of the family file for a written register
+    of_writes: dict[str, Any] = field(default_factory=dict)  # keys that it would need to be written
 
     def note_write(self, *, is_written: bool = True) -> None:
-        """Record whether the source program writes the register; a write is reported in the family file."""
+        """Record whether the program that made the file writes the register; if it does, add a gap."""
         self.is_written = is_written
         if is_written:
             self.gaps.append(WRITTEN)
 
     def put_names(self, key: str, pairs: Mapping[Any, Any]) -> None:
-        """Add names of the register's values or bits. Invalid names are reported in the family file.
+        """Add names of the register's values or bits. The number of invalid names is added to `gaps`.
 
         If a value or bit has several names, the first is used.
         """
@@ -490,7 +491,7 @@ def declare_text(found: ImportedRegister) -> Text:
 
 
 def _drop_conflicts(device: ImportedDevice, held: dict[str, Register[Any]]) -> None:
-    """Remove references to scale registers, and then registers, until the class is valid."""
+    """Remove references to scale registers, and then registers, until they form a valid drive class."""
     by_name = {found.name: found for found in device.registers}
     gaps = {HOLDING: device.readable} if device.readable else {}
     while wrong := _conflicts({**held, "readable_gaps": gaps}):

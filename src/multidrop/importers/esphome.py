@@ -105,7 +105,7 @@ def read_esphome(document: Any) -> list[ImportedDevice]:
 
 
 def _parts(document: Any) -> Iterator[dict[str, Any]]:
-    """Yield the document and its packages. A package that is a list only has entities."""
+    """Yield the document and its packages. For a list of entities, yield each entity by itself."""
     if isinstance(document, list):
         entities = [each for each in document if isinstance(each, dict) and each.get("platform") == PLATFORM]
         yield from ({_kind_of(entity): entity} for entity in entities)
@@ -258,9 +258,9 @@ def _add(device: ImportedDevice, kind: str, name: str, entry: Mapping[str, Any])
 
 
 def _filters(register: ImportedRegister, filters: Any) -> None:
-    """Combine factors and offsets into a step and an offset, in their order.
+    """Combine the filters "multiply" and "offset", in their order, into a step and an offset.
 
-    Other filters are reported in the family file.
+    Other filters are added to the register's `gaps`.
     """
     step, offset = Fraction(1), Fraction(0)
     others: list[str] = []

@@ -68,7 +68,7 @@ VERIFY_KEYS = key_table(imported="address input_type state_on state_off", irrele
 _DEFAULT_TABLES = {"sensors": "holding", "binary_sensors": "coil"}
 _NOT_READ = ("climates", "covers")
 _LEGACY_KINDS = {"sensor": "sensors", "binary_sensor": "binary_sensors", "switch": "switches"}
-# table of the entities in each list; "": each entity states its table
+# Modbus table of each list's entities; "": each entity states it
 _LEGACY_LISTS = {"registers": "", "inputs": "", "coils": "coil"}
 MOST_REPEATED = 1000  # limit of the key virtual_count
 _DEEPEST = 4  # limit of packages within packages
@@ -122,7 +122,7 @@ def _lack(document: Any, hubs: list[Mapping[str, Any]]) -> str:
 
 
 def _hubs(found: Any, place: str, depth: int) -> Iterator[Mapping[str, Any]]:
-    """Yield the hubs of a document: below `modbus:`, in packages, or in the document itself."""
+    """Yield each hub (Modbus connection) that a document contains."""
     if isinstance(found, dict):
         if (place == "modbus" and "type" in found) or any(kind in found for kind in (*KEYS, *_NOT_READ)):
             yield found
@@ -240,7 +240,7 @@ def _add(device: ImportedDevice, kind: str, name: str, entry: Mapping[str, Any])
 def _verify(register: ImportedRegister, entry: Mapping[str, Any]) -> None:
     """Read the state of a switch from its state register, if it has one.
 
-    Values for on and off other than 1 and 0 are reported in the family file.
+    Values for on and off other than 1 and 0 are added to the register's `gaps`.
     """
     on, off = entry.get("command_on", 1), entry.get("command_off", 0)
     verify = entry.get("verify")
@@ -298,7 +298,7 @@ def _swap(register: ImportedRegister, entry: Mapping[str, Any]) -> str:
 
 
 def _format(register: ImportedRegister, kind: str, entry: Mapping[str, Any]) -> str | None:
-    """Return the number format of a data type, or None. A doubtful width is reported in the family file."""
+    """Return the number format of a data type, or None. Add a doubtful width to the register's `gaps`."""
     registers = whole(entry, "count", 1)
     if kind in _LEGACY_TYPES:
         # applies only to floats, because an int has 16 bits in every version

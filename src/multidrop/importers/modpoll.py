@@ -61,7 +61,7 @@ def _reference(device: ImportedDevice, cells: list[str], table: str, order: str)
         device.lose(name, f"which bits {kind} means is not known")
         return
     if text := _STRING.fullmatch(kind):
-        # the byte order of the poll does not apply to texts
+        # A byte order that modpoll states for a whole group of registers does not apply to texts.
         register.details = {"length": (int(text[1]) + 1) // 2}
         device.add(register, is_text=True)
         return

@@ -44,10 +44,7 @@ def number_format(kind: str) -> str | None:
 
 
 def format_of_width(kind: str, words: int) -> str | None:
-    """Return the number format of a type without a width, such as int, for a width of `words` words.
-
-    Return None for unknown types.
-    """
+    """Return the number format of a type such as int with a width of `words` words; None if unknown."""
     letter = _ANY_WIDTH.get(kind.strip().lower())
     return f"{letter}{16 * words}" if letter and words in (1, 2, *((4,) if letter != "BCD" else ())) else None
 
@@ -72,7 +69,9 @@ def put_number(details: dict[str, Any], number: str, order: str = "") -> None:
 
 
 def scaled(details: dict[str, Any], step: Any, offset: Any = 0) -> None:
-    """Set `step` and `offset` in `details`. Values without effect are not set: step 0 or 1, and offset 0.
+    """Set `step` and `offset` in `details`, except a step of 1 or an offset of 0, which have no effect.
+
+    A step of 0 means that no step is given.
 
     Raises ValueError if one of them is not a number.
     """

@@ -54,7 +54,7 @@ def read_sunspec(document: Mapping[str, Any]) -> list[ImportedDevice]:
                 _add(device, point, name, address + at * size, names)
         address += size * count
     if FIRST < address <= 0x10000:
-        # one read may include any register of a model, because a model has no holes
+        # All addresses of a SunSpec model have registers, so a read may span unused ones.
         device.readable = range(FIRST, address)
     for register in device.registers:
         _tie(register, names)
@@ -124,7 +124,7 @@ def _add(
 
 
 def _tie(register: ImportedRegister, names: Mapping[str, str]) -> None:
-    """Set the step from a scale factor that is a number, or the scale register from one that is a point."""
+    """Set the step if the scale factor is a number; if it is a register, set the scale register."""
     scale = register.details.pop("scale_register", None)
     if isinstance(scale, int):
         register.details["step"] = 10**scale if 0 <= scale <= 10 else float(f"1e{scale}")

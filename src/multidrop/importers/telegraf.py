@@ -144,7 +144,7 @@ def _fields(plugin: Mapping[str, Any]) -> Iterator[_Field]:
         for block in plugin.get(kind) or () if style in ("", kind) else ():
             for field in block.get("fields") or ():
                 table = block.get("register", "holding") if kind == "request" else field.get("register")
-                order = str(block.get("byte_order") or "ABCD")  # the default of Telegraf in these styles
+                order = str(block.get("byte_order") or "ABCD")  # default of the styles "request" and "metric"
                 yield _Field(field, kind, block.get("slave_id", slave), table or "holding", order, text)
 
 
@@ -211,8 +211,8 @@ def _number(
 def _plain_type(style: str, kind: str, words: int) -> str:
     """Return a type name that means the same in all configuration styles of the plugin.
 
-    In the style "register", FLOAT32 is a whole number of one word for each listed address; the type of a
-    float has a name that ends in -IEEE. In the other styles, FLOAT32 is a float.
+    In the style "register", only types whose names end in -IEEE are floats. FLOAT32 is a whole number there,
+    with one word for each listed address. In the other styles, FLOAT32 is a float.
     """
     if style != "register":
         return kind.removesuffix("-IEEE")
@@ -222,7 +222,7 @@ def _plain_type(style: str, kind: str, words: int) -> str:
 
 
 def _part(kind: str, field: Mapping[str, Any]) -> tuple[str, str]:
-    """Return the bits that a type below 16 bits uses ("" for all), and the type of the number."""
+    """Return which bits of the word a type uses ("" for all), and the type of the whole number."""
     if kind == "BIT":
         return str(whole(field, "bit", 0)), "UINT16"
     if kind in ("INT8L", "UINT8L", "INT8H", "UINT8H"):

@@ -31,7 +31,8 @@ from multidrop.importers.parsing import bits_text, count, float_of_bits, put_num
 _NOT_JSON = re.compile(r'("(?:\\.|[^"\\])*+(?:"|\\?\Z))|//[^\n]*|/\*.*?(?:\*/|\Z)|,(?=\s*[\]}])', re.DOTALL)
 MOST_READ = 125
 _DEEPEST = 8  # limit of subdevices within subdevices
-PART = "its place in a larger channel"  # extra key for a part of a channel that consists of several parts
+# key that marks an entry as one of several parts of a channel; reports show it as an unimported key
+PART = "its place in a larger channel"
 _TABLES = {
     **{"holding": "holding", "holding_single": "holding", "holding_multi": "holding"},
     **{"input": "input", "coil": "coil", "discrete": "discrete"},
@@ -82,12 +83,15 @@ PORT_KEYS = key_table(
 
 
 def json_without_comments(text: str) -> str:
-    """Return valid JSON: remove the comments and trailing commas that the program's templates may have."""
+    """Return valid JSON: remove the comments and trailing commas that wb-mqtt-serial allows."""
     return _NOT_JSON.sub(lambda found: found[1] or "", text)
 
 
 def read_wb(document: Any) -> list[ImportedDevice]:
-    """Return the devices of a template or of a configuration. Raises ValueError for other documents."""
+    """Return the devices of a wb-mqtt-serial template or configuration file.
+
+    Raises ValueError for other documents.
+    """
     if not isinstance(document, dict):
         kind = type(document).__name__
         raise ValueError(f"the file is neither a wb-mqtt-serial template nor a SunSpec model: it is a {kind}")

@@ -47,9 +47,9 @@ _former: dict[str, FormerPeers] = {}  # by identity of the port; every change is
 
 
 def identities_of(*names: str) -> set[str]:
-    """Return the identities of the open port that has these names.
+    """Return the identity of an open port for each of its names.
 
-    The number of a pseudo-terminal is soon reused, so its identity here includes its creation time.
+    The identity of a pseudo-terminal includes its creation time, because its number is soon reused.
     """
     found = {port_identity.of_name(name) for name in names}
     return {f"{name} of {_made_ns(name)}" if is_pseudo_terminal(name) else name for name in found}
@@ -63,9 +63,9 @@ def _made_ns(device: str) -> int:
 
 
 def remember_former_peers(names: Iterable[str], peers: Iterable[tuple[int, Peer]]) -> None:
-    """Keep the records of a closed port's drives that have late replies due, under each name of the port.
+    """When a port is closed, keep the records of those drives that may still send late replies.
 
-    `peers` are pairs of a drive's address and its record.
+    The records are kept under each name of the port. `peers` are pairs of a drive's address and its record.
     """
     now_ns = clock.now_ns()
     for name, former in [*_former.items()]:
@@ -77,7 +77,7 @@ def remember_former_peers(names: Iterable[str], peers: Iterable[tuple[int, Peer]
 
 
 def former_at(names: Iterable[str], address: int) -> Iterator[Peer]:
-    """Yield the records of drives at this address whose late replies were due when the port was closed."""
+    """Yield the kept records of drives that had this address when the port was closed."""
     for name in names:
         former = _former.get(name)
         yield from (peer for at, peer in former.peers if at == address) if former else ()
@@ -103,7 +103,7 @@ class Peers:
         self._known: dict[tuple[int, *tuple[object, ...]], Peer] = {}
 
     def add(self, drive: Drive) -> None:
-        """Add a drive; a drive that was on the line before keeps its learnt timing and late replies.
+        """Add a drive. A drive that was on the line before gets its earlier record, with its learnt timing.
 
         First wait until no exchange with an earlier drive at this address is in flight. Until then, it is
         unknown which replies of the earlier drive are late.
@@ -115,7 +115,7 @@ class Peers:
         least = min(drive.response_timeout, documented)
         asked_as = type(drive), drive.framing, drive.settings, silence(drive), least, drive.response_timeout
         key = drive.address, *asked_as
-        # a known record is used again and never replaced: the core may still read its list of proofs
+        # a known record is used again and never replaced, because the core's thread may still be reading it
         if key not in self._known:
             self._known[key] = self._new(drive, least)
         peer = self.present[drive] = self._known[key]
@@ -138,7 +138,7 @@ class Peers:
         return peer
 
     def close(self) -> None:
-        """Close the line. If it is opened again, replies that are still due then count as late."""
+        """Close the line. If it is opened again, replies to earlier requests are recognised as late."""
         names = self._names()
         self._line.close()
         remember_former_peers(names, [(address, peer) for (address, *_), peer in self._known.items()])
@@ -147,7 +147,7 @@ class Peers:
         return identities_of(self._line.identity, self._line.port)
 
     def remember(self, before: Peers) -> None:
-        """Take over the records of an earlier bus on the same line: of its drives and its removed drives."""
+        """Take over the records of all present and removed drives of an earlier bus on the same line."""
         self._known.update(before._known)
 
     def remove(self, drive: Drive) -> None:
@@ -344,11 +344,11 @@ class PreparedReads:
             return ReadPlan(wanted, registers, tuple(map(prepare, reversed(blocks(drive, registers)))))
 
         self.of = of
-        self.newest = NOTHING  # the last plan: a read with the same tuple needs no hash of its registers
+        self.newest = NOTHING  # the last plan, used again without a search if the same tuple is read
         self.prepare = prepare
         # for each block that the drive does not answer as a whole: the smaller blocks to read instead
         self.parts: dict[Block, tuple[Block, ...]] = {}
-        # blocks that may be too long for the drive, but that it has answered
+        # blocks that the drive has answered although they might be too long for it
         self.answered: set[Block] = set()
 
     def ask_first(self, block: Block) -> None:

@@ -118,11 +118,11 @@ class Exchanges:
     # ---- reading ----
 
     def read(self, drive: Drive, registers: Sequence[Register[Any] | Text | str]) -> dict[str, Any]:
-        """Return the registers' values by name, as `values` does. If the port is lost, reopen it.
+        """Return the registers' values by name, as `values` does. Reopen a lost port and read again.
 
-        Some gateways close the connection after each reply. If the port was already closed, or is lost after
-        an answer of the drive, reopen it and read block by block. Raises PortLost if the port is lost before
-        the drive has answered, or twice in a row at the same block.
+        Some gateways close the connection after each reply, so the second attempt reads block by block.
+        Raises PortLost if the drive has not answered since the port was opened, or if the port is lost twice
+        in a row at the same block.
         """
         try:
             return self.values(drive, registers, READ_ATTEMPTS)
@@ -180,13 +180,14 @@ class Exchanges:
     ) -> dict[str, Any]:
         """Return the values of these registers (Register objects or names), by name.
 
-        Each block is tried up to `attempts` times. If the drive does not answer a whole block, its parts are
-        read instead. Later calls then read the parts at once, until the port is reopened.
+        One request reads a block of adjacent registers. Each block is tried up to `attempts` times. If the
+        drive does not answer a whole block, its parts are read instead, also by later calls until the port is
+        reopened.
 
         With `insists`, each request is sent immediately, even if a late reply could be mistaken for its
         reply. On a slow connection, such a request waits up to `timeout` seconds for its reply.
 
-        Raises NoValue if a register holds no value, and TextWanted if one of `registers` is a text.
+        Raises NoValue if a register holds no valid value, and TextWanted if one of `registers` is a text.
         """
         prepared = self._prepare(drive)
         plan = prepared.newest
@@ -269,7 +270,7 @@ class Exchanges:
         return self.values(drive, [register], attempts, insists=insists)[register.name]
 
     def text(self, drive: Drive, text: Text, attempts: int = READ_ATTEMPTS, *, insists: bool = False) -> str:
-        """Return a text, read in as many requests as the family's limit on their length requires."""
+        """Return a text. If it is longer than the family's limit for one read, several requests read it."""
         reads = (self._read_block(drive, block, attempts, insists) for block in text_blocks(drive, text))
         return text.decode(b"".join(reads))
 
@@ -375,7 +376,7 @@ class Exchanges:
         """Send a write once, before queued polling, as soon as no late reply can be mistaken for its reply.
 
         The write is not sent after `expires_ns` (CLOCK_BOOTTIME; 0: no limit), or after a stop has revoked
-        `permit`. Then the call waits at least `timeout` seconds for the reply.
+        `permit`. Once it is sent, the call waits at least `timeout` seconds for the reply.
 
         With `insists`, the write is sent without waiting for late replies. On a slow connection, the call
         then waits up to `timeout` seconds for the write's reply.

@@ -184,8 +184,9 @@ class Line:
         self._why_lost: str | None = None
         # why calls fail although the line is not closed yet; None: they do not fail
         self.why_closing: str | None = None
-        # When polling ended; None: not yet. Closing waits for a stalled adapter until CLOSING_S after this
-        # time, so several stalled lines that close in turn delay the end no longer than one.
+        # When polling ended; None: not yet. A stalled adapter has until CLOSING_S after this time to take the
+        # last bytes. So a process that closes several stalled lines in turn waits no longer than for one
+        # line.
         self.ended_ns: int | None = None
         self._make_locks()
         register_at_fork(self)
@@ -338,13 +339,16 @@ class Line:
                 self.queue.tap(tap)
 
     def require(self, settings: tuple[int, str]) -> None:
-        """Set a bridged port's settings. Raises LineError if it has other settings, or rejects these."""
+        """Set the baud rate and format of a bridged port, whose settings cannot change later.
+
+        Raises LineError if other settings are in use, or if the port rejects these.
+        """
         with self._lock:
             self._opened.require(settings)
 
     @property
     def only_settings(self) -> tuple[int, str] | None:
-        """The fixed settings of a bridged port; None for other ports."""
+        """The fixed settings of a port whose requests a thread forwards (a bridge); None for other ports."""
         return self._opened.settings if self._opened.bridge else None
 
     def inherit(self, peer: Peer, before: Peer) -> None:
@@ -432,7 +436,7 @@ class Line:
 
     @property
     def may_send(self) -> bool:
-        """True if this process is the line's master, or if the line has no mastership."""
+        """True if this process may send now: if the line has a mastership, this process must hold it."""
         return self.mastership is None or self.mastership.holds
 
     def note_stall(self) -> None:

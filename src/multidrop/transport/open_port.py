@@ -212,7 +212,7 @@ def failing_refusals(device: str) -> int:
 
 
 TOLERANCE = 0.02  # greatest relative error of a baud rate that the core and the kernel accept
-CLOSING_S = 0.75  # s; longest time that closing a port waits for the adapter to take the driver's bytes
+CLOSING_S = 0.75  # seconds in which a stalled adapter must take the driver's bytes when the port closes
 _UNNOTICED_S = 0.05  # s; a healthy adapter takes all bytes of the driver within this time
 BY_PLACE = "/dev/serial/by-path/"  # links whose names state the USB socket, not the adapter
 _NO_SETTINGS = -1
@@ -355,8 +355,8 @@ class OpenPort:
     def close(self, seconds: float = CLOSING_S) -> None:
         """Close the port, even if opening it failed halfway.
 
-        The adapter has `seconds` s to accept the driver's bytes; then the rest is discarded. With
-        `must_discard`, all bytes are discarded now.
+        The adapter has `seconds` s to take the driver's unsent bytes; then the rest is discarded. If the
+        attribute `must_discard` is True, all unsent bytes are discarded immediately.
         """
         if self.bridge:
             self.bridge.close()
@@ -378,14 +378,15 @@ class OpenPort:
         if self.bridge:
             self.bridge.forget()
             self.bridge = None
-        # the parent uses a network port's connection, which pyserial would end: close only its socket here
+        # For a network port, close only the socket: pyserial would end the connection, which the parent still
+        # uses.
         port = connection_of(self._serial) or self._serial
         if port:
             with suppress(*PORT_FAILURES):
                 port.close()
 
     def require(self, settings: tuple[int, str]) -> None:
-        """Set the baud rate and format of a bridged port, which cannot change later.
+        """Set the baud rate and format of a bridged port, whose settings cannot change later.
 
         Raises LineError if the port already has other settings, or rejects these.
         """

@@ -21,9 +21,10 @@ _INTERFACE = re.compile(r"[\d.-]+:(\d+\.\d+)")  # 1-4.2:1.0 is an interface of t
 
 @dataclass(frozen=True)
 class USBAdapter:
-    """One port of a USB adapter: its place on the USB bus, and the adapter's serial number ("" without one).
+    """One port of a USB adapter: the USB socket (`place`), and the serial number or "".
 
-    `has_twin` means that another adapter has the same serial number: then the place must be the same too.
+    With `has_twin`, another adapter has the same serial number. Then only an adapter in the same socket is
+    the same one.
     """
 
     place: str
@@ -45,7 +46,8 @@ def adapter_of(device: str) -> USBAdapter | None:
     found = (TTYS / Path(device).name / "device").resolve()
     for part in (found, *found.parents):
         if interface := _INTERFACE.fullmatch(part.name):
-            number = f"{interface[1]}.{_text(found / 'port_number') or 0}"  # "1.0.0": interface and port
+            # such as "1.0.0": port 0 of the USB interface 1.0
+            number = f"{interface[1]}.{_text(found / 'port_number') or 0}"
             serial = _text(part.parent / "serial")
             return USBAdapter(f"{part.parent.name}:{number}", serial and f"{serial}:{number}")
     return None
@@ -199,7 +201,8 @@ def ledger_of(identity: str, directory: Path) -> Path:
 class SimulatedPort:
     """Marks a port as simulated until `close`; `is_simulated` finds this mark from any process of the user.
 
-    The port's counts of EEPROM writes (see `ledger_of`) are deleted when the mark is set and removed.
+    The port's counts of EEPROM writes (see `ledger_of`) are deleted when the mark is set, and again when it
+    is removed.
     """
 
     def __init__(self, identity: str, directory: Path) -> None:

@@ -142,9 +142,9 @@ class Statistics:
     def utilisation(self) -> float:
         """Fraction of the line's time that the answered exchanges needed.
 
-        An exchange needs silence, request, response delay and reply, at the line's settings. If the port is
-        faster than its settings (a network, a pseudo-terminal), the measured time of the exchange is the
-        limit. An exchange counts when it ends: see `counted_s`.
+        An exchange needs silence, request, response delay and reply, at the line's settings. A port may be
+        faster than its settings, such as a network or a pseudo-terminal: then the measured time of the
+        exchange counts instead. An exchange counts when it ends: see `counted_s`.
         """
         return self.used_s / (self.seconds if self.counted_s is None else self.counted_s)
 
@@ -333,5 +333,5 @@ class LineMeter:
 
 
 def _begins(reading: Count) -> Count:
-    """Return the reading with a new epoch number, because a line was opened or reset."""
+    """Return these statistics with a new epoch number, which shows that a line was opened or reset."""
     return reading._replace(statistics=replace(reading.statistics, epoch=next(_EPOCHS)))

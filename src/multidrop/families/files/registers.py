@@ -521,7 +521,7 @@ def _decoded(data: bytes, place: TomlPlace) -> str | None:
         place.wrong(f"is not text in UTF-8, from byte {failure.start} on; save it as CSV UTF-8")
         return None
     if "\0" in text:
-        place.wrong("has zero bytes; save it as CSV UTF-8")
+        place.wrong("contains NUL bytes; save it as CSV UTF-8")
         return None
     return text
 
