@@ -48,6 +48,22 @@ def test_a_loaded_recording_has_every_value_and_every_miss(look: Recording) -> N
     assert look.seconds == 100
 
 
+@pytest.mark.parametrize("set_by_s", [-3600, 0, 3 * 86400])
+def test_the_duration_of_a_recording_does_not_change_if_the_clock_is_set(
+    tmp_path: Path, set_by_s: int
+) -> None:
+    times = [(at + set_by_s * (at > 49), at) for at in range(100)]
+    rows = [Row(UTC_0 + t * SECOND, at * SECOND, 1000, "pump", "speed", 1.0, "ok") for t, at in times]
+    assert load(record(tmp_path / "a.arrows", rows, ABOUT)).seconds == 99
+
+
+def test_the_duration_of_a_recording_includes_restarts_of_the_computer(tmp_path: Path) -> None:
+    """The monotonic clock was at 500 s, and starts again at 20 s after a pause of 60 s."""
+    times = [(at, 450 + at) for at in range(51)] + [(110 + at, 20 + at) for at in range(11)]
+    rows = [Row(UTC_0 + t * SECOND, at * SECOND, 1000, "pump", "speed", 1.0, "ok") for t, at in times]
+    assert load(record(tmp_path / "a.arrows", rows, ABOUT)).seconds == 50 + 60 + 10
+
+
 @pytest.mark.parametrize("suffix", [".arrows", ".csv", ".parquet"])
 def test_recordings_of_every_format_are_read_as_the_same_data(tmp_path: Path, suffix: str) -> None:
     with open_writer(tmp_path / f"it{suffix}", METADATA) as writer:

@@ -35,6 +35,7 @@ LARGEST = 1e150  # larger values are not drawn, because matplotlib multiplies va
 # The time between two rows is a pause if it is longer than PAUSE_NS, and longer than PAUSE_STEPS times the
 # interval before it and PAUSE_STEPS times the interval after it.
 PAUSE_NS, PAUSE_STEPS = 2 * 10**9, 5
+RESTART_NS = 10 * 10**9  # the monotonic clock goes back by more than this only if the computer restarts
 MOST_ROWS = 100_000_000  # limit of a recording's rows, which then take 5 GB of memory
 MOST_NAMES = 4096  # limit of the number of different names: of drives, of registers, and of statuses
 
@@ -151,6 +152,7 @@ class Recording:
     path: Path
     metadata: Mapping[str, Any]
     series: tuple[Series, ...]
+    seconds: float  # duration, without the time that the computer slept
     truncated: int  # number of skipped bytes at the recording's end
     steps: tuple[StepSpan, ...] = ()  # steps of a test run, named by their phases
     events: tuple[Event, ...] = ()  # in the order of their times
@@ -176,10 +178,6 @@ class Recording:
     @cached_property
     def end(self) -> int:
         return max(int(series.time.max()) for series in self.series)
-
-    @property
-    def seconds(self) -> float:
-        return (self.end - self.begin) / 1e9
 
     def about(self, drive: str) -> Mapping[str, Any]:
         found: Mapping[str, Any] = self.metadata.get("drives", {}).get(drive, {})
@@ -264,7 +262,20 @@ def load(path: str | Path) -> Recording:
     if trigger := trigger_of(metadata):
         events.add(trigger)
     in_order = sorted(events, key=lambda event: event.time)
-    return Recording(Path(path), metadata, polled, reader.truncated, tuple(steps), tuple(in_order))
+    seconds = _seconds(time, monotonic)
+    return Recording(Path(path), metadata, polled, seconds, reader.truncated, tuple(steps), tuple(in_order))
+
+
+def _seconds(time: Array, monotonic: Array) -> float:
+    """Return the duration of a recording in s. `time` and `monotonic` are its rows' times in ns.
+
+    It is measured by the monotonic clock, because the time of day may be set meanwhile. Only the time of a
+    restart of the computer, which also restarts the monotonic clock, is measured by the time of day.
+    """
+    back, ahead = np.diff(monotonic) < -RESTART_NS, np.diff(time - monotonic) > RESTART_NS
+    starts = np.flatnonzero(back & ahead) + 1
+    awake = sum(int(part.max()) - int(part.min()) for part in np.split(monotonic, starts))
+    return (awake + int(np.diff(time)[starts - 1].clip(0).sum())) / 1e9
 
 
 def _steps(phases: Series, end: tuple[int, int]) -> list[StepSpan]:
