@@ -128,7 +128,7 @@ class Quiet(Toy):
 
 
 @pytest.mark.parametrize("confirmed", [0, 1])
-def test_a_command_other_than_a_stop_is_not_broadcast_by_stop_all(confirmed: int) -> None:
+def test_a_harmless_broadcast_is_not_sent_as_a_stop(confirmed: int) -> None:
     drives = [Quiet(address, confirmed=confirmed) for address in (1, 2)]
     line = SimulatedBus(*(simulated(drive) for drive in drives))
     for drive in drives:
@@ -226,7 +226,7 @@ def setpoint_of(drive: Any) -> Any:
 
 
 @table("model", SETTING)
-def test_only_a_stop_can_be_broadcast_after_the_bus_was_left(model: str) -> None:
+def test_a_bus_broadcasts_nothing_but_stops_after_leave(model: str) -> None:
     line, drives, _ = line_of(model, model)
     assert 0 in setpoint_of(drives[0]).broadcast
     line.bus.leave()
@@ -272,7 +272,7 @@ def test_an_expired_setpoint_is_not_broadcast(tmp_path: Path) -> None:
     assert audit.read_text(encoding="utf-8") == ""
 
 
-def test_identity_checks_of_many_drives_do_not_expire_a_broadcast() -> None:
+def test_a_broadcast_does_not_expire_during_many_identity_checks() -> None:
     """The checks of 20 drives take longer than the expiry of one write."""
     line, drives, _ = line_of(*["invt-che"] * 20)
     line.sleep(60)
@@ -311,7 +311,8 @@ def test_the_note_on_an_interruption_counts_the_broadcast_stop() -> None:
     assert {*interruption.value.__notes__} == {f"invt-che@1: {told}", f"invt-che@2: {told}"}
 
 
-def test_only_stops_and_zero_setpoints_are_broadcast_and_to_one_family_only() -> None:
+def test_a_broadcast_allows_only_a_stop_or_a_zero_setpoint() -> None:
+    """A line with drives of two families allows no broadcast."""
     sims = [simulated(InvtCHE(1)), simulated(InvtCHE(2))]
     line = SimulatedBus(*sims)
     first, _ = (line.attach(sim.drive) for sim in sims)

@@ -97,8 +97,8 @@ def test_read_many_returns_values_in_the_requested_order() -> None:
 
 REQUESTS = {  # requests for all readings, from the manuals' register maps and limits
     ErmanERG220: 2,  # two reads: 1 to 12, including unused addresses, and 0400H to 0403H
-    InvtCHE: 4,  # four reads: one of 1001H, two of 3000H to 3016H, one of 5000H and 5001H
-    InnovertIBD: 2,  # two reads: one of PrA.03 and PrA.04, one of PrA.22
+    InvtCHE: 4,  # four reads: 1001H, 3000H to 3016H in two parts, and 5000H together with 5001H
+    InnovertIBD: 2,  # two reads: PrA.03 together with PrA.04, and PrA.22
     DelixiModbus: 32,  # one register per request
     DelixiNative: 33,
     YD1000: 16,
@@ -325,7 +325,7 @@ def half_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.slow
-def test_a_lost_confirmation_of_an_unreadable_register_is_unconfirmed() -> None:
+def test_a_write_without_reply_or_readable_register_is_unconfirmed() -> None:
     rig = simulated(Rig(1))
     with faulty(rig, losing(0x06)) as sim, Bus(path(sim)) as bus:
         ours = bus.attach(Rig, 1)

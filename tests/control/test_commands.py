@@ -162,7 +162,7 @@ async def test_all_stops_are_sent_before_any_is_repeated(threads: Threads, failu
 
 
 @pytest.mark.slow
-def test_if_no_thread_can_start_stops_do_not_block_the_event_loop(threads: Threads) -> None:
+def test_the_event_loop_is_not_blocked_by_stops_without_threads(threads: Threads) -> None:
     motors = Motors(a=3, b=2)
     turns = 0
 
@@ -301,7 +301,8 @@ def test_a_repeated_stop_is_in_progress_from_its_call_to_its_end() -> None:
         repeated = asyncio.get_running_loop().create_future()
         pump.under_way = {}
         stops.note([drive], repeated)
-        assert stops.of(drive) is repeated  # even if the thread of the stop has not started yet
+        # The stop counts as in progress before its thread has started.
+        assert stops.of(drive) is repeated
         await asyncio.sleep(0.9 * BEGINNING_S)
         assert stops.of(drive) is repeated
         await asyncio.sleep(0.2 * BEGINNING_S)
@@ -318,7 +319,7 @@ def test_a_repeated_stop_is_in_progress_from_its_call_to_its_end() -> None:
     run_controlled(live())
 
 
-def test_drives_whose_stop_is_already_repeated_are_separated() -> None:
+def test_the_drives_with_a_repeated_stop_are_listed_separately() -> None:
     async def live() -> None:
         stops = RepeatedStops(stop_noted, on_threads)
         drives: list[Any] = [NotedStops(), NotedStops(), NotedStops()]
@@ -333,7 +334,7 @@ def test_drives_whose_stop_is_already_repeated_are_separated() -> None:
     run_controlled(live())
 
 
-def test_a_line_is_stopped_as_a_whole_unless_one_of_its_drives_is_being_stopped() -> None:
+def test_a_repeated_stop_splits_the_stop_of_its_line() -> None:
     async def live() -> None:
         wholes: list[float | None] = []
 
@@ -394,7 +395,7 @@ def test_a_stop_that_takes_over_from_an_unsuccessful_stop_returns_its_own_result
     assert timed.calls == [0.0, None]
 
 
-def test_a_stop_is_not_repeated_if_an_earlier_stop_used_up_its_time() -> None:
+def test_a_stop_is_not_repeated_after_its_time_limit() -> None:
     timed = TimedStops(NotedStops(), 0)
     assert run_controlled(timed.called_beside(REPEATED_S + 1)) == SILENT
     assert timed.calls == [0.0]

@@ -118,7 +118,7 @@ def test_stops_are_sent_despite_a_full_disk(tmp_path: Path, caplog: pytest.LogCa
     flush_log(PATIENCE_S)
     assert not sim.motor.energised
     assert "the audit log cannot be written: " in caplog.text
-    assert line.bus.audit_trouble == "File too large"  # the error of the full disk that `full_at` simulates
+    assert line.bus.audit_trouble == "File too large"  # the system's error beyond the limit of `full_at`
     drive.set_frequency(30)
     assert line.bus.audit_trouble == ""
     line.bus.close()

@@ -460,7 +460,8 @@ def test_a_third_signal_ends_the_process_though_a_drive_is_silent() -> None:
             each.loses = lambda request: True
         process.send_signal(signal.SIGINT)
         until(lambda: stops(received[0]))
-        for _ in range(20):  # more than three, because the system may merge them
+        # The system may merge signals that arrive together, so more than three are sent.
+        for _ in range(20):
             process.send_signal(signal.SIGINT)
             try:
                 process.wait(0.1)
@@ -573,7 +574,7 @@ def test_a_poller_restores_the_handlers_that_its_bus_replaced(caught: list[int],
 
 
 @pytest.mark.long
-def test_sigterm_stops_drives_before_a_handler_installed_between_pollers_runs(caught: list[int]) -> None:
+def test_a_programs_own_sigterm_handler_runs_after_the_stops(caught: list[int]) -> None:
     """The program's own SIGTERM handler, installed between two pollers, runs once the motor has stopped."""
     drive = InvtCHE(1, maximum_frequency=50, name="pump")
     energised: list[bool] = []

@@ -167,7 +167,7 @@ def _idle(bus: Bus, drive: Any, received: Any, monkeypatch: pytest.MonkeyPatch) 
     bus.peer(drive).c.answered_ns -= 2 * PAUSE_NS
     at_ns = clock.now_ns
     monkeypatch.setattr(clock, "now_ns", lambda: at_ns() + 2 * PAUSE_NS)
-    _asleep(bus, drive, received, monkeypatch)  # wait until the boot-time clock has advanced too
+    _asleep(bus, drive, received, monkeypatch)  # advances the boot-time clock by the same time
 
 
 def _read_since(bus: Bus, drive: Any, received: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -293,7 +293,7 @@ class Mute(Drive):
 
 
 @pytest.mark.parametrize("is_lost", [False, True])
-def test_a_read_without_a_wait_precedes_the_first_stop(
+def test_a_read_is_sent_immediately_before_the_first_stop(
     monkeypatch: pytest.MonkeyPatch, is_lost: bool
 ) -> None:
     """The read shows whether the adapter echoes: an echo could be mistaken for the drive's confirmation."""
@@ -321,7 +321,7 @@ def test_a_read_without_a_wait_precedes_the_first_stop(
 
 
 @pytest.mark.parametrize("is_in_step", [True, False])
-def test_an_unambiguous_identity_check_before_a_stop_confirms_the_drive(is_in_step: bool) -> None:
+def test_an_identity_check_with_late_replies_confirms_no_drive(is_in_step: bool) -> None:
     bus, drive, _ = one(InvtCHE(1, maximum_frequency=50))
 
     def fall_out_of_step(request: Message) -> bytes | None:
@@ -368,7 +368,7 @@ REFUSALS = [
 
 
 @table(("model", "code"), REFUSALS)
-def test_a_stop_is_sent_after_an_exception_to_the_identity_check(model: str, code: int) -> None:
+def test_a_stop_is_sent_if_the_check_gets_an_exception_reply(model: str, code: int) -> None:
     line, drive, sim = one(MAKE[model](1))
     sim.motor.energised = True
 
@@ -438,7 +438,8 @@ def test_the_error_of_a_withheld_stop_says_what_to_do() -> None:
     assert line.written != []
 
 
-OTHERS: Sequence[tuple[Drive, Drive]] = (  # (declared drive, drive on the line): equal framing and baud rate
+# the declared drive, and the drive that answers at its address with the same framing and baud rate
+OTHERS: Sequence[tuple[Drive, Drive]] = (
     (InvtCHE(1, maximum_frequency=50), YD1000(1)),
     (InnovertIBD(1, confirmed=0), InvtCHE(1)),
     (YD1000(1), InvtCHE(1)),
@@ -447,7 +448,7 @@ OTHERS: Sequence[tuple[Drive, Drive]] = (  # (declared drive, drive on the line)
 
 
 @table("pair", OTHERS)
-def test_the_error_of_a_withheld_stop_has_the_other_familys_command(pair: tuple[Drive, Drive]) -> None:
+def test_the_error_of_an_unsent_stop_names_the_actual_family(pair: tuple[Drive, Drive]) -> None:
     declared, there = pair
     sim = simulated(there)
     line = SimulatedBus(sim)
@@ -486,7 +487,9 @@ def shows(line: SimulatedBus, drive: Drive, name: str, count: int) -> None:
 
 @table(("model", "name", "count"), UNEXPECTED_COUNTS)
 @table("how", ["stop", "stop_all", "write"])
-def test_one_odd_value_prevents_a_start_but_no_stop(model: str, name: str, count: int, how: str) -> None:
+def test_an_unexpected_register_value_prevents_writes_but_no_stop(
+    model: str, name: str, count: int, how: str
+) -> None:
     line, drive, _ = one(MAKE[model](1))
     shows(line, drive, name, count)
     with pytest.raises(WriteForbidden):
@@ -518,7 +521,7 @@ def test_a_drive_that_refuses_the_identity_check_is_sent_its_stop(model: str) ->
     assert STOPS[model](writes(line)[0])
 
 
-def test_no_stop_waits_for_the_second_identity_check_of_another_drive() -> None:
+def test_a_stop_does_not_wait_for_another_drives_second_check() -> None:
     """The stop of an identified drive does not wait for the first check of another drive either."""
     others = [YD1000(1), InvtCHE(2, maximum_frequency=50), InvtCHE(3, maximum_frequency=50)]
     line = SimulatedBus(*(simulated(drive) for drive in others))
@@ -539,7 +542,7 @@ def test_no_stop_waits_for_the_second_identity_check_of_another_drive() -> None:
 
 
 @pytest.mark.parametrize("suspicions", [1, 2])
-def test_a_plain_stop_write_is_withheld_after_two_wrong_identities(suspicions: int) -> None:
+def test_a_written_stop_is_refused_after_two_wrong_replies(suspicions: int) -> None:
     line, drive, _ = one(InvtCHE(1))
     odd = build_reply(Framing.RTU, Message(1, 3, data=b"\x01\x0a"))  # a Goodrive300L
     line.answers = lambda request: odd if len(line.frames) <= suspicions else None
@@ -579,7 +582,7 @@ def answers_as(line: SimulatedBus, counts: dict[int, int]) -> None:
     line.answers = answer
 
 
-def test_registers_of_other_makes_are_read_only_before_the_first_write() -> None:
+def test_registers_of_other_makes_are_not_read_after_the_first_write() -> None:
     """An INNOVERT IBD does not answer reads of registers that it lacks. Each such read delays polling."""
     line, drive, _ = one(InnovertIBD(1, confirmed=1))
     count_silences(line)

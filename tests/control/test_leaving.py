@@ -84,7 +84,7 @@ def test_detached_drives_are_stopped_if_stop_on_exit_was_called(
     flush_log(60)
     told = [record.getMessage() for record in caplog.records if record.name == "multidrop.bus"]
     assert len(told) == 1
-    assert told[0].startswith("invt-che@2: failed after 30")  # no stop was sent to this drive
+    assert told[0].startswith("invt-che@2: failed after 30")  # the port was lost, so no stop was sent
     pair.line.fails = lambda request: None
 
 
@@ -160,7 +160,7 @@ def test_attaching_a_drive_of_another_open_bus_raises() -> None:
     line.bus.detach(drive)
     other.attach(drive)
     other.bus.close()
-    line.attach(drive)  # the other bus is closed
+    line.attach(drive)  # allowed, because closing the other bus has detached the drive
 
 
 def test_a_drive_can_be_attached_to_another_bus_while_its_bus_closes(monkeypatch: pytest.MonkeyPatch) -> None:

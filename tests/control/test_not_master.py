@@ -345,7 +345,8 @@ def waits(far: int, bus: Bus, drive: Slow) -> float:
 @pytest.mark.long
 def test_a_new_master_listens_before_its_first_request(shared: tuple[int, Bus, Mastership]) -> None:
     far, bus, mastership = shared
-    drives = [bus.attach(Slow(address)) for address in (1, 2, 3)]  # a new drive has no late replies
+    # The drives are new, because a request to a drive with a late reply would wait longer.
+    drives = [bus.attach(Slow(address)) for address in (1, 2, 3)]
     listening = LISTENING + Slow.response_timeout
     assert waits(far, bus, drives[0]) >= listening
     assert waits(far, bus, drives[1]) < listening
@@ -438,7 +439,8 @@ def test_a_stop_on_an_unopened_port_says_it_was_not_sent(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize("port", ["rfc2217://127.0.0.1:4001", "loop://", "spy:///dev/null"])
-def test_a_bus_with_a_mastership_refuses_ports_that_pyserial_opens(port: str) -> None:
+def test_a_shared_line_cannot_use_a_port_that_pyserial_opens(port: str) -> None:
+    """A `Mastership` is the right to send on a line that several processes share."""
     with pytest.raises(
         NoSuchPort, match="a line with a mastership needs a port that the core writes to itself"
     ):
@@ -447,12 +449,12 @@ def test_a_bus_with_a_mastership_refuses_ports_that_pyserial_opens(port: str) ->
         Bus.awaiting(port, mastership=Mastership())
 
 
-def test_mastership_of_another_type_raises_type_error() -> None:
+def test_a_mastership_of_another_type_raises_type_error() -> None:
     with pytest.raises(TypeError, match=r"^mastership takes a multidrop\.core\.Mastership, not 0\.7$"):
         Bus("/dev/null", mastership=0.7)  # type: ignore[arg-type]
 
 
-def test_a_bus_without_a_mastership_sends_as_usual(scene: Scene) -> None:
+def test_a_bus_on_an_unshared_line_sends_without_permission(scene: Scene) -> None:
     path = scene.simulator.wires[0].path
     scene.bus.close()
     with Bus(path) as bus:

@@ -118,7 +118,7 @@ def test_a_ramp_cancelled_by_a_stop_names_the_write_that_was_not_sent() -> None:
     assert len(line.written) == before
 
 
-def test_a_reset_that_a_stop_cancels_still_clears_its_coil(tmp_path: Path) -> None:
+def test_a_fault_reset_clears_its_coil_after_a_stop(tmp_path: Path) -> None:
     """Otherwise the reset coil would stay on, and reset the next fault by itself."""
     audit = tmp_path / "audit"
     line, drive, _ = one(ErmanERG220(1), audit=audit)
@@ -426,7 +426,7 @@ def test_writing_the_setpoint_register_sets_the_known_setpoint() -> None:
 
 
 @pytest.mark.parametrize("later", [30.0, None])
-def test_an_unsent_write_keeps_the_setpoint_of_a_later_write(later: float | None) -> None:
+def test_an_unsent_write_does_not_change_a_later_setpoint(later: float | None) -> None:
     setpoint = KnownSetpoint()
     setpoint.value = 20.0
     take_back = setpoint.begin_write()

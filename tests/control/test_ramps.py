@@ -306,7 +306,7 @@ def test_each_started_drive_is_sent_a_stop_before_one_is_repeated(monkeypatch: p
     assert noted.calls == [(1, 0.0), (2, 0.0), (1, None), (2, None)]
 
 
-def test_if_no_thread_can_start_interrupted_stops_are_sent_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_stop_is_sent_again_without_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     _, drives, sims = che_drives(2)
     sims[1].trip(4)
     noted = NotedCalls(drives)

@@ -179,7 +179,7 @@ def test_writes_to_registers_in_ram_are_not_in_the_ledger(tmp_path: Path) -> Non
     assert ledger.wear(0) == []
     fan.write(fan.latch, 1)
     assert [each.cell.register for each in ledger.wear(0)] == ["latch"]
-    assert set(sim.counters.eeprom_writes) == {"known", "latch"}  # `ram` is unknown to the simulation
+    assert set(sim.counters.eeprom_writes) == {"known", "latch"}  # the simulated drive has no option `ram`
 
 
 with_names = pytest.mark.skipif(sys.platform != "linux", reason="this system has no names for it")
@@ -257,7 +257,7 @@ def test_a_real_port_does_not_count_as_simulated() -> None:
     os.close(master)
 
 
-def test_a_system_that_cannot_mark_simulated_ports_counts_all_writes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_simulated_write_is_counted_if_its_port_is_not_recognised(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(port_identity, "_HAS_NAMES", False)
     with toys() as sim:
         write(sim.wires[0].path, 12.0)
@@ -518,7 +518,8 @@ class Nameless:
         raise ZeroDivisionError
 
 
-NAMES: list[tuple[Any, str | None]] = [  # an invalid author, and its text in the record of a stop
+# Invalid names for the author of a write, and the text that the audit record of a stop has instead.
+NAMES: list[tuple[Any, str | None]] = [
     ("", None),
     ("  ", None),
     ("a\nb", r"a\nb"),

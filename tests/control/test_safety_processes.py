@@ -98,7 +98,7 @@ def test_closing_a_bus_with_stop_on_exit_stops_motors_and_restores_handlers() ->
         assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
         written = [write.raw for write in sim.counters.writes]
         assert written[0] == 5
-        assert set(written) <= {5, 8}  # 5 is repeated if a busy computer gets a reply late
+        assert set(written) <= {5, 8}  # stops (5) and STOP_JOG (8), repeated if a reply is late
 
 
 CELL = LedgerCell("/dev/ttyUSB0", 1, "delixi-modbus", "frequency")
@@ -289,7 +289,7 @@ def test_a_write_is_unconfirmed_if_the_next_read_reveals_an_echo() -> None:
     drive.set_frequency(20)
 
     def echo(request: Message) -> bytes | None:
-        line.has_echo |= not is_write(request)  # as the core does when a reply follows the echo
+        line.has_echo |= not is_write(request)  # the core sets this flag when a reply follows an echo
         return build_request(drive.framing, request) if is_write(request) else None
 
     line.answers = echo

@@ -129,7 +129,7 @@ class SharedPair:
         self._spoke = next((side for side in self._sides[:2] if side in said), self._spoke)
         for listener in sorted(self._sides, key=lambda side: side == self._spoke):
             if listener == self._spoke and self._drives in said:
-                sleep(SLOT)  # ptys are slow: the other client must receive the reply first
+                sleep(SLOT)  # the client that sent no request must receive the reply first
             others = [each for speaker, each in said.items() if speaker != listener]
             received = self._mixed(others)
             if received:
@@ -159,7 +159,8 @@ def shared(drives: str, baudrate: int, seed: int) -> Iterator[SharedPair]:
 
 
 RTU_FAMILIES = [model for model in MAKE if model != "delixi-native"]
-ROUNDS, MOST_ROUNDS = 3, 60  # least and greatest number of starts; more than ROUNDS only until a collision
+# The motor is started ROUNDS times, and then until two requests have collided, but at most MOST_ROUNDS times.
+ROUNDS, MOST_ROUNDS = 3, 60
 
 
 @contextmanager

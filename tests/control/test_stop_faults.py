@@ -106,7 +106,7 @@ def test_a_stop_called_by_a_signal_handler_cancels_the_interrupted_start(verb: s
     line, (drive,), (sim,) = che_drives(runs_s=10)
     drive.stop()
     stop = line.bus.stop_all if verb == "stop_all" else getattr(drive, verb)
-    start, first = drive.start, 9  # a stop before bytecode 9 would come before the start
+    start, first = drive.start, 9  # bytecodes 1 to 8 are executed before the start is called
     for nth in chain(range(first, first + 80, 4), count(first + 80, 499)):
         with calling_at(nth, is_ours, stop) as place, suppress(CancelledByStop, Unconfirmed):
             start()

@@ -270,8 +270,8 @@ class Stops(RuleBasedStateMachine):
         back = [each for each in self.line.log if each.connection == self.line.connection]
         assert [str(each) for each in back if each.what == "moves"] == []
         assert failures or not self.responders[0].runs
-        for drive in self.responders:  # resets the motors, because some may not have been stopped
-            drive.switch_on()
+        for drive in self.responders:
+            drive.switch_on()  # a restart, which also ends runs that were not stopped
         self._open()
 
     @precondition(lambda self: not self.threads and not self.polling)
@@ -371,7 +371,7 @@ def test_no_call_that_started_before_a_stop_moves_a_motor_after_it(kind: str) ->
 
 
 @pytest.mark.parametrize("kind", usually(*KINDS))
-def test_a_stop_during_a_start_wins_at_each_of_its_first_exchanges(kind: str) -> None:
+def test_a_stop_during_the_first_exchanges_of_a_start_cancels_it(kind: str) -> None:
     """The stop is called after 0 to 5 exchanges of the start; the test calls the machine's rules itself."""
     machine = type(f"StopsOf{kind}", (Stops,), {"kind": kind})()
     machine.begin(polling=False, on_exit=False)

@@ -483,7 +483,7 @@ def test_a_stop_whose_script_ignores_failures_is_not_reported_as_done(failure: B
     assert drive.stop().ok
 
 
-def test_a_stop_without_a_read_is_not_reported_as_seen() -> None:
+def test_a_stop_result_mentions_that_standstill_was_not_read() -> None:
     line = SimulatedBus(simulated(Own(1)))
     drive = line.attach(Own(1))
     assert drive.stop().text == f"stopped: {UNSEEN}"
@@ -710,8 +710,8 @@ class Meter(Drive):
 def test_a_stop_of_a_whole_line_skips_a_device_without_a_motor(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    flush_log(60)  # records of earlier tests
-    caplog.clear()
+    flush_log(60)
+    caplog.clear()  # removes log records of earlier tests
     line = SimulatedBus(simulated(YD1000(1)), simulated(Meter(2)))
     line.attach(YD1000(1, name="pump"))
     meter = line.attach(Meter(2, name="meter"))

@@ -253,7 +253,7 @@ def test_a_stop_reopens_a_lost_port(tmp_path: Path, ending: str) -> None:
 
 
 @pytest.mark.parametrize("opener", ["the poller", "the stop"])
-def test_closing_a_poller_with_a_lost_port_stops_its_motors(
+def test_a_closing_poller_stops_motors_after_reopening_the_port(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, opener: str
 ) -> None:
     """The motors are stopped whether the poller or the stop reopens the port."""

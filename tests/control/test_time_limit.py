@@ -66,7 +66,7 @@ def test_a_call_delayed_past_its_time_limit_raises_expired(line: SimulatedBus, s
 
 
 @pytest.mark.parametrize("slept_before", [0, 3600])
-def test_a_time_limit_counts_sleep_only_within_its_block(line: SimulatedBus, slept_before: float) -> None:
+def test_a_time_limit_does_not_count_sleep_before_it_starts(line: SimulatedBus, slept_before: float) -> None:
     line.slept += slept_before
     before = len(written(line))
     with within(line, 0.5):
@@ -98,7 +98,7 @@ class Slow(Drive):
 
 
 @pytest.mark.parametrize(("before", "between", "sent"), [(0.1, 0.1, 2), (0.1, 5.0, 2), (0.9, 0.1, 0)])
-def test_only_the_start_of_a_verb_has_a_time_limit(before: float, between: float, sent: int) -> None:
+def test_the_time_limit_applies_only_to_a_verbs_first_write(before: float, between: float, sent: int) -> None:
     """Unlike the limit, the bus's own expiry does not count the time that a script waits."""
     line = SimulatedBus(simulated(Slow(1)))
     drive = line.bus.attach(Slow(1, confirmed=1))
@@ -137,7 +137,7 @@ def test_a_stop_is_sent_after_the_time_limit(line: SimulatedBus) -> None:
     assert len(written(line)) > before
 
 
-def test_a_stop_called_by_the_limit_function_cancels_the_call(line: SimulatedBus) -> None:
+def test_a_stop_within_the_deadline_function_cancels_the_write(line: SimulatedBus) -> None:
     """A program can therefore check for stops in its `limit` function, and misses none."""
     drive = line.bus.drives[0]
     before = len(written(line))
@@ -226,7 +226,7 @@ def test_a_start_does_not_expire_because_of_slow_reads() -> None:
 
 
 @pytest.mark.parametrize(("more", "is_sent"), [(0.25, True), (0.35, False)])
-def test_a_start_does_not_expire_while_its_reads_take_their_allowed_time(more: float, is_sent: bool) -> None:
+def test_a_start_does_not_expire_if_its_reads_end_in_time(more: float, is_sent: bool) -> None:
     """A read may take as long as its timeout, two silences and 64 characters together."""
     line = SimulatedBus(simulated(Looking(1)))
     drive = line.attach(Looking(1, confirmed=1, silence=0.1))
@@ -241,7 +241,7 @@ def test_a_start_does_not_expire_while_its_reads_take_their_allowed_time(more: f
 
 
 @pytest.mark.parametrize(("waits", "is_sent"), [(5.9, True), (6.1, False)])
-def test_the_least_interval_of_a_drive_does_not_count_towards_expiry(waits: float, is_sent: bool) -> None:
+def test_a_write_does_not_expire_during_the_drives_required_pause(waits: float, is_sent: bool) -> None:
     line = SimulatedBus(simulated(Resting(1)))
     drive = line.attach(Resting(1, confirmed=1))
     line.bus.check_identity(drive)
@@ -300,7 +300,7 @@ def test_a_start_is_not_sent_when_the_computer_wakes(tmp_path: Path, sleeps: boo
     answer, begun, slept = sim.answer, tmp_path / "begun", tmp_path / "slept"
 
     def answer_and_sleep(request: Message, now: float) -> Message | None:
-        if sleeps and begun.exists():  # the computer sleeps at the first read of the start
+        if sleeps and begun.exists():  # simulates a sleep at the first request of `drive.start`
             slept.touch()
         return answer(request, now)
 

@@ -203,7 +203,7 @@ def test_only_values_within_limits_can_be_encoded(family: type[Drive], register:
 
 
 @table("family, register", registers(lambda each: each.span and each.default is not None))
-def test_every_factory_value_is_within_its_limits(family: type[Drive], register: Register[Any]) -> None:
+def test_a_factory_value_survives_encoding_and_decoding(family: type[Drive], register: Register[Any]) -> None:
     assert register.decode(register.encode(register.default)) == register.default
 
 
@@ -368,7 +368,8 @@ def test_every_call_of_a_script_uses_yield_from() -> None:
         and isinstance(node.value.value, ast.Call)
     ]
     assert len(carried_out) > 80
-    for node in carried_out:  # without its `yield from`, `forgotten` must find the call
+    # Each of these calls would be a mistake without `yield from`, and `forgotten` must then find it.
+    for node in carried_out:
         call = node.value.value  # type: ignore[attr-defined]
         assert forgotten(ast.Module([ast.Expr(call)], []), scripts) == [call.lineno]
 

@@ -29,7 +29,7 @@ STOP_OFF = "01 05 00 01 00 00 9C 0A"
 EMERGENCY_ON = "01 05 00 02 FF 00 2D FA"
 RESET_ON = "01 05 00 09 FF 00 5C 38"
 RESET_OFF = "01 05 00 09 00 00 1D C8"
-FREQUENCY_28_5 = "01 06 00 02 01 1D E9 93"  # the example of function 06, with the right address 0002H
+FREQUENCY_28_5 = "01 06 00 02 01 1D E9 93"  # the manual's example has the wrong address 0001H
 
 STOPPED = {
     "frequency": 25.0,
@@ -79,7 +79,7 @@ def test_erman_line_settings_and_limits_are_those_of_the_document() -> None:
     assert ErmanERG220.most_registers == {HOLDING: 88, INPUT: 17, COIL: 12}
     assert ErmanERG220.readable_gaps == {HOLDING: range(0x59), INPUT: range(0x1000)}
     assert set(ErmanERG220.exceptions) == {1, 2, 3, 4}
-    # the document explains its example reply 01 86 03 02 61 in this way
+    # The manual explains code 3 at its example of an exception reply, 01 86 03 02 61.
     assert "read or write" in ErmanERG220.exceptions[3]
     assert "write" in drive.exception(4)
     assert not ErmanERG220.broadcasts
@@ -169,11 +169,11 @@ def test_erman_stop_without_effect_is_followed_by_emergency_stop_and_raises() ->
     with pytest.raises(Unconfirmed, match="not seen to have stopped"):
         wire.drive.stop()
     assert wire.sent == [STOP_ON, START_OFF, EMERGENCY_ON]
-    assert 30 <= wire.seconds <= 31  # two waits of 15 s each: the deceleration time and STOP_MARGIN
+    assert 30 <= wire.seconds <= 31  # two waits, each of 10 s (deceleration time) and 5 s (STOP_MARGIN)
 
 
 @table("failure", [NoReply("drive"), BadReply("drive", "odd", b"\1"), DriveException("drive", 2, "")])
-def test_erman_emergency_stop_follows_if_the_deceleration_time_is_unreadable(failure: Exception) -> None:
+def test_an_erman_is_stopped_without_a_readable_deceleration_time(failure: Exception) -> None:
     says = {**STOPPED, "deceleration_time": failure, "status": ErmanStatus.RUNNING}
     stops = {EMERGENCY_ON: {"status": ErmanStatus.STOPPED}}
     wire = Wire(ErmanERG220(1), says, turns=stops)
@@ -304,7 +304,9 @@ def test_erman_setpoint_is_written_to_0002h_within_its_limits() -> None:
         ),
     ],
 )
-def test_erman_state_shows_phase_and_fault(status: int, fault: int, condition: Condition, note: str) -> None:
+def test_the_erman_state_mentions_the_last_fault(
+    status: int, fault: int, condition: Condition, note: str
+) -> None:
     says = {"status": ErmanERG220.status.decode(status), "last_fault": ErmanERG220.last_fault.decode(fault)}
     state = Wire(ErmanERG220(1), says).drive.state()
     assert (state.condition, state.note, state.fault) == (condition, note, None)
@@ -319,7 +321,7 @@ def test_erman_last_fault_with_only_unnamed_bits_counts_as_a_fault() -> None:
     assert wire.sent == []
 
 
-def test_erman_models_03_and_04_fail_the_identity_check() -> None:
+def test_an_erman_without_register_0400h_fails_the_identity_check() -> None:
     Wire(ErmanERG220(1), STOPPED).drive.identify()
     with pytest.raises(WriteForbidden, match="0400H"):
         Wire(ErmanERG220(1), {"status": DriveException("drive", 1, "")}).drive.identify()

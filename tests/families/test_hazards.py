@@ -535,7 +535,7 @@ def test_yd1000_uses_only_functions_03_and_06_and_never_address_0() -> None:
         YD1000(0)
 
 
-def test_yd1000_frame_lengths_differ_from_the_wrong_table() -> None:
+def test_yd1000_frame_lengths_are_not_those_of_the_manual() -> None:
     """Errata Y3, Y4."""
     assert len(build_request(Framing.RTU, Message(1, 6, 0x1001, data=b"\x1f\x40"))) == 8
     request = Message(1, 3, 0x1100, 1)

@@ -295,7 +295,7 @@ def test_innovert_ibd_state_is_unknown_unless_its_outputs_are_programmed() -> No
         (0x3900, Condition.FAULT),
     ],
 )
-def test_innovert_ibd_programmed_outputs_decode_to_the_state(raw: int, condition: Condition) -> None:
+def test_the_innovert_ibd_state_is_read_from_its_outputs(raw: int, condition: Condition) -> None:
     says = {"terminals": InnovertIBD.terminals.decode(raw), **PROGRAMMED}
     assert Wire(InnovertIBD(1), says).drive.state().condition is condition
 

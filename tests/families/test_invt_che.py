@@ -142,7 +142,7 @@ UNDOCUMENTED = "has 0005H at 1001H, a state that the manual does not explain"
         ("jog", CHEStatus.FORWARD, TURNS_ALREADY),
         ("jog", CHEStatus.REVERSE, TURNS_ALREADY),
         ("jog", 5, UNDOCUMENTED),
-        ("start", 5, UNDOCUMENTED),  # the motor may turn the other way
+        ("start", 5, UNDOCUMENTED),  # the motor may already turn in the opposite direction
     ],
 )
 @table("direction", [None, *Direction])
@@ -189,10 +189,11 @@ def test_invt_che_stop_jog_is_sent_after_a_refused_stop() -> None:
     assert wire.sent == [STOP] * 3 + [STOP_JOG]
 
 
-def test_invt_che_stop_jog_is_sent_after_an_unconfirmed_stop() -> None:
+def test_the_command_stop_jog_follows_an_unconfirmed_stop() -> None:
     """A drive whose replies are lost may still receive the stop. The stop may not end a jog."""
     lost = Unconfirmed("drive", "control = STOP", "no reply")
-    for of_a_jog in ([], [lost] * 3):  # STOP_JOG is sent only once, because the caller repeats the whole stop
+    # STOP_JOG is sent once, even if it is unconfirmed too: the caller then repeats STOP and STOP_JOG.
+    for of_a_jog in ([], [lost] * 3):
         wire = Wire(InvtCHE(1), {"status": CHEStatus.FORWARD}, {STOP: [lost] * 3, STOP_JOG: of_a_jog})
         with pytest.raises(Unconfirmed, match="control = STOP"):
             wire.drive.stop()
@@ -211,7 +212,7 @@ def test_invt_che_stop_jog_is_sent_if_the_state_after_a_stop_is_unknown(unseen: 
     assert wire.sent == [STOP, STOP_JOG]
 
 
-def test_invt_che_stop_jog_is_not_sent_to_a_drive_of_another_make() -> None:
+def test_the_command_stop_jog_is_not_sent_to_another_make() -> None:
     wire = Wire(
         InvtCHE(1), {"status": CHEStatus.FORWARD}, {STOP: [WriteForbidden("another family is there")]}
     )

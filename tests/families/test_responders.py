@@ -100,7 +100,7 @@ SHEETS = {
         {1: 350, 3: 230, 5: 305, 14: 72, 17: 250, 0x1000: 300},
         {"output_frequency": 35, "input_voltage": 230, "pressure": 3.05, "pressure_setpoint": 3},
     ),
-    # erman.py: input registers from 2000 on, parameter Pnnn at 1000 + nnn.
+    # Source: the public program erman.py. Input registers start at 2000; parameter Pnnn is at 1000 + nnn.
     "erman-er-g-220-05": Sheet(
         {INPUT + 2000: 350, INPUT + 2004: 4, INPUT + 2006: 305, 1100: 0, 1001: 300, 1006: 1000},
         {"output_frequency": 35, "pressure": 3.05, "pressure_setpoint": 3},
@@ -129,7 +129,8 @@ SHEETS = {
         ((0x2000, 0x01),),
         (0x2000, 0x10),
     ),
-    # stand_drive.py: PA02 is the frequency, PA27 the fault and PA28 the state; Pb01 = 5 and Pb02 = 2.
+    # Source: the public program stand_drive.py. PA02 is the frequency, PA27 the fault and PA28 the state;
+    # Pb01 = 5 and Pb02 = 2.
     "innovert-idd-mini-plus": Sheet(
         {2: 0, 3: 0, 22: 0, 0x1B: 0, 0x1C: 0, 101: 5, 102: 2, 108: 100},
         {"output_frequency": 20, "output_current": 2.5},
@@ -151,7 +152,7 @@ SHEETS = {
         ((0x2000, 0x01),),
         standing=Condition.UNKNOWN,
     ),
-    # Delixi protocol, part 3: K = 02 commands, 03 reads the state, 04 sets the frequency, 07 reads.
+    # Delixi protocol, part 3. Function codes: 02 run command, 03 state, 04 setpoint, 07 read of parameters.
     "delixi-native": Sheet(
         {0: 2, 1: 1, 428: 3, 430: 1, 500: 0, 531: 0, 0x30000: 1},
         {"output_frequency": 20},
@@ -188,8 +189,8 @@ SHEETS = {
         ((0x2000, 5),),
         (0x2000, 7),
     ),
-    # CHE100 manual p. 117 to 119. The values 3137, 5564, 293, 70, 1882, 262, 198 are a row of an owner's
-    # public log.
+    # The registers are from the CHE100 manual, p. 117 to 119. The values 3137, 5564, 293, 70, 1882, 262 and
+    # 198 are from a log that an owner of this drive has published.
     "invt-chf100a": Sheet(
         {0x1000: 0, 0x1001: 3, 0x2000: 0, 0x3000: 0, 0x3002: 5564, 0x3006: 0, 0x3016: 0x0201, 0x5000: 0},
         {"output_frequency": 31.37, "dc_bus_voltage": 556.4, "output_power": 2.62},
@@ -252,8 +253,8 @@ SHEETS = {
     "delta-cp2000": with_registers(DELTA, {0x2200: 0}, {0x2200: 840}, output_current=8.4),
     "delta-vfd-el": with_registers(DELTA, {0x2104: 0}, {0x2104: 84}, output_current=8.4),
     "delta-ms300": with_registers(DELTA, {0x2105: 5401}, {}, dc_bus_voltage=540.1),
-    # ATV312.yaml: control word CMD at 8501, status word ETA at 3201. The control words 6, 7 and 15 start the
-    # motor in three steps; 7 stops it again.
+    # Source: the public register list ATV312.yaml. Register 8501 (CMD) takes commands, 3201 (ETA) shows the
+    # status. The commands 6, 7 and 15, one after another, start the motor; 7 stops it.
     "schneider-atv320": Sheet(
         {8501: 0, 8502: 0, 3201: 0x0250, 3202: 0, 3204: 0, 7121: 0},
         {"output_frequency": 20, "output_current": 8.4},

@@ -39,12 +39,12 @@ SAME_WORDS = (
     {"innovert-ibd", "innovert-idd-mini-plus"},
     {"yaskawa-a1000", "yaskawa-v1000"},
 )
-# Families with INVT's control words at the same addresses: a stop is sent, and a start is refused.
+# Families with the same stop. If one is declared as another, it can be stopped, but not started.
 SAME_STOP = {"invt-che", "invt-chf100a", "fuling-dzb"}
 
 AT_2000 = ("invt-goodrive", "powtran-pi130")
-# For each declared family, the families whose motor its stop word would run. The stop is not sent if the
-# drive's registers prove that it is of such a family. See docs/reference/profiles.md.
+# Declared families, each with the families whose motors would run if they received its stop. The stop is not
+# sent if the drive's registers prove that it is of such a family. See docs/reference/profiles.md.
 RUNS_AT_A_STOP = {
     **dict.fromkeys(("innovert-ibd", "innovert-idd-mini-plus", "delixi-modbus"), AT_2000),
     **dict.fromkeys(("delta-vfd-el", "delta-ms300", "delta-cp2000"), AT_2000),
@@ -125,15 +125,15 @@ def test_a_stop_never_starts_a_drive_of_another_make(declared: str, turns: bool,
 
 
 @table(("declared", "there"), [(one, other) for one, others in RUNS_AT_A_STOP.items() for other in others])
-def test_documentation_lists_the_stops_that_are_withheld(declared: str, there: str) -> None:
+def test_the_documentation_lists_stops_that_would_start_other_makes(declared: str, there: str) -> None:
     page = (Path(__file__).parents[2] / "docs" / "reference" / "profiles.md").read_text("utf-8")
     rows = [row.split("|") for row in page.splitlines() if re.search(r"\| 000[16]H \|", row)]
     assert any(f"`{declared}`" in row[1] and f"`{there}`" in row[3] for row in rows)
 
 
 @pytest.mark.parametrize("declared", ["delta-vfd-el", "delta-cp2000"])
-def test_a_goodrive_is_recognised_if_a_parameter_equals_its_address(declared: str) -> None:
-    """Register 0900H of a Goodrive is P09.00, whose value may equal the address."""
+def test_a_goodrive_declared_as_a_delta_is_recognised(declared: str) -> None:
+    """P09.00 of a Goodrive, at 0900H, may be equal to its address. A Delta has its address in 0900H."""
     pair = Pair(declared, "invt-goodrive", turns=False)
     show = pair.sim.answer
     pair.sim.answer = lambda request, now: (

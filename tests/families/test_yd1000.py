@@ -198,7 +198,7 @@ def test_yd1000_extended_parameter_address_follows_from_its_name() -> None:
             with pytest.raises(
                 ValueError, match=f"^{name} is already declared for every YD1000, as {register.name}$"
             ):
-                extended(name)  # a register that is declared with `never` must not become writable
+                extended(name)  # must not make a register writable that is never written
     for wrong in ("F1000", "F24A", "f240", "240", "F24"):
         with pytest.raises(ValueError, match="F and three digits"):
             extended(wrong)
@@ -386,7 +386,7 @@ def test_no_yd1000_verb_except_release_control_clears_bits_15_and_14() -> None:
     assert all(word & 0xC000 == 0xC000 for word in words)
 
 
-def test_yd1000_emergency_stop_bit_is_cleared_once_it_is_confirmed() -> None:
+def test_the_yd1000_emergency_stop_bit_is_always_cleared() -> None:
     wire = Wire(YD1000(1), STANDING)
     wire.drive.emergency_stop()
     assert [wire.sent[0][:17], *wire.sent[1:]] == ["01 06 10 00 D0 00", STOP]
@@ -471,11 +471,12 @@ FUNCTIONS = {f"input_{at}_function": factory for at, factory in enumerate((2.0, 
 @table(
     ("verb", "consequence"),
     [
-        ("reset_fault", ", and may start the motor"),  # a restart may clear bit 15, as power-on does (8.1)
+        # A restart may clear bit 15 of the control word, as power-on does (8.1). Then terminals have control.
+        ("reset_fault", ", and may start the motor"),
         ("release_control", ", .* once the line no longer commands it"),
     ],
 )
-def test_yd1000_release_of_control_is_refused_if_a_terminal_would_run_it(
+def test_a_closed_run_terminal_prevents_a_yd1000_reset_or_release(
     says: dict[str, object], terminal: str, verb: str, consequence: str
 ) -> None:
     wire = Wire(YD1000(1), {**STANDING, **FUNCTIONS, **says})

@@ -280,7 +280,7 @@ def test_apply_writes_no_more_parameters_after_a_stop(family: type[Drive]) -> No
     assert len(line.written) > sent
 
 
-def test_a_stop_while_the_journal_is_written_cancels_the_write(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_during_a_journal_write_prevents_the_parameter_write(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = attached(YD1000(1), [])
     note = _Journal.note
 
@@ -297,7 +297,9 @@ def test_a_stop_while_the_journal_is_written_cancels_the_write(monkeypatch: pyte
     assert "0009: 100 -> 200: not written" in params.apply(drive, {"0009": 200}).earlier
 
 
-def test_stop_while_the_plan_is_read_cancels_all_writes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_while_parameters_are_read_cancels_all_writes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     line, drive, _ = attached(made(GOODRIVE), EXTRA[GOODRIVE])
     read = drive.link.read_raw
     monkeypatch.setattr(drive.link, "read_raw", lambda *given: (drive.stop(), read(*given))[1])
@@ -306,11 +308,9 @@ def test_stop_while_the_plan_is_read_cancels_all_writes(monkeypatch: pytest.Monk
     assert {frame[6:11] for frame in line.written} == {"20 00"}  # the only write is the stop
 
 
-# room: bytes until the disk is full. In each row, writing another line of the journal fails.
+# `room` is the number of free bytes on the disk. Each number lets a different line of the journal fail.
 @table("room", [0, 100, 130, 160, 200, 230])
-def test_remaining_parameters_are_written_after_a_full_disk(
-    monkeypatch: pytest.MonkeyPatch, room: int
-) -> None:
+def test_an_application_is_completed_after_a_full_disk(monkeypatch: pytest.MonkeyPatch, room: int) -> None:
     line, drive, _ = attached(ErmanERG220(1), [])
     # the EEPROM ledger is not affected by the full disk
     monkeypatch.setattr(Ledger, "enter", lambda *given: "")
@@ -427,6 +427,7 @@ def test_the_writes_of_a_killed_apply_are_completed_by_the_next_apply(
         assert {names[code]: 1 for code in differing} == {
             name: count for name, count in sim.counters.eeprom_writes.items() if name in names.values()
         }
-        if not was_complete:  # if complete, `apply` returned its report before the kill
+        # A killed call may have returned its report. Otherwise the next call reports the writes of both.
+        if not was_complete:
             reported = (tmp_path / "report").read_text().splitlines()
             assert differing <= {line.partition(":")[0] for line in reported}

@@ -97,7 +97,7 @@ def test_a_silent_drive_raises_the_error_no_reply() -> None:
         params.read(drive)
 
 
-# Typed from the sources: model, code, address of the holding register.
+# Model, parameter code and register address, copied from the sources beside them.
 ADDRESSES = [
     ("delta-cp2000", "04-10", 0x040A),  # CP2000 manual p. 12.1-09-8
     ("powtran-pi130", "F0.01", 0xF001),  # PI130 manual p. 112
@@ -132,7 +132,7 @@ def test_hazardous_and_unexplained_parameters_are_not_written(model: str, codes:
     assert [code for code in codes.split() if not known[code].never] == []
 
 
-def test_explained_parameters_of_a_delixi_e_are_written() -> None:
+def test_a_delixi_e_parameter_without_explanation_is_not_writable() -> None:
     """The file DelixiCDIE100.cpp explains these codes.
 
     The other codes in it are for commands, motor identification and communication.

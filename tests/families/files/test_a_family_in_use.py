@@ -146,7 +146,7 @@ def test_plant_with_two_family_files_works(run: Run, plant: Path, monkeypatch: p
 
 
 @pytest.mark.parametrize(("name", "value"), [("light", "1"), ("ramp", "1"), ("run", "off")])
-def test_unconfirmed_family_writes_only_harmless_counts(pump: type[Drive], name: str, value: str) -> None:
+def test_an_unconfirmed_family_file_allows_no_writes(pump: type[Drive], name: str, value: str) -> None:
     """Without a stop verb, even the declared harmless raw counts are not sent, because they are untested."""
     wire = Wire([simulated(pump(2))], port=ANY_PORT, unpaced=True)
     with Simulator([wire]) as line, Bus(wire.path) as bus:
@@ -173,7 +173,7 @@ def test_no_broadcast_is_sent_for_an_unconfirmed_family_file(tmp_path: Path) -> 
     assert line.written == []
 
 
-def test_confirmed_drive_of_a_family_file_accepts_writes(pump: type[Drive]) -> None:
+def test_a_family_file_allows_writes_with_the_option_confirmed(pump: type[Drive]) -> None:
     wire = Wire([simulated(pump(2))], port=ANY_PORT, unpaced=True)
     with Simulator([wire]) as line, Bus(wire.path) as bus:
         drive = bus.attach(pump, address=2, confirmed=1)
@@ -199,7 +199,7 @@ def test_family_file_without_commands_needs_no_confirmation(plant: Path) -> None
         ("above = 5\nbelow = 7", 7, False),
     ],
 )
-def test_section_identify_of_a_family_file_recognises_drives(
+def test_a_family_file_recognises_drives_by_its_section_identify(
     tmp_path: Path, proof: str, value: int, is_one: bool
 ) -> None:
     path = tmp_path / "meter.toml"

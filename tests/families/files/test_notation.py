@@ -85,7 +85,7 @@ def test_invalid_addresses_in_a_family_file_are_refused(given: Any, sentence: st
 
 
 @table("table", ["holding", "input", "coil", "discrete"])
-def test_every_address_can_be_written_if_counts_from_is_0(table: str) -> None:
+def test_an_address_as_toml_text_is_read_back_unchanged(table: str) -> None:
     for address in (0, 9, 10_000, 10_001, 19_999, 30_001, 39_999, 40_000, 40_017, 49_999, 0xFFFF):
         written = tomllib.loads(f"at = {sent_as(address, table)}")["at"]
         assert Counting(0).address(written, table, "holding") == (address, table)

@@ -330,7 +330,7 @@ def test_start_of_a_profidrive_during_off2_or_off3_is_refused(name: str) -> None
     assert line.sim.motor.energised
 
 
-def test_off2_from_a_terminal_during_a_run_is_reported_and_not_overridden() -> None:
+def test_a_coast_command_during_a_run_is_not_overridden() -> None:
     line = Line("siemens-v20")
     line.runs()
     line.drive.write(line.drive.control, line.drive.control.decode(0x047C))
@@ -349,7 +349,7 @@ def test_reset_of_a_trip_that_only_a_power_cycle_clears_is_refused() -> None:
     line.runs()
 
 
-def test_start_of_an_optidrive_with_the_old_status_word_is_refused() -> None:
+def test_an_optidrive_with_swapped_status_bytes_cannot_be_started() -> None:
     line = Line("optidrive-e3")
     line.sim.is_first_reading = True
     line.drive.set_frequency(20)

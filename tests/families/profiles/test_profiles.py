@@ -45,7 +45,7 @@ def test_every_profile_is_documented(profile: type[Drive]) -> None:
 
 
 @every_profile
-def test_no_raw_count_declared_harmless_is_a_start_or_reset_word(profile: Any) -> None:
+def test_a_stop_word_is_harmless_and_a_reset_word_is_not(profile: Any) -> None:
     harmless = profile.roles["control"].harmless
     assert profile.stop_word in harmless
     assert profile.coast_word is None or profile.coast_word in harmless
@@ -378,7 +378,7 @@ HINDRANCES = [
     ("danfoss-fc51", 0x0600, "is not ready"),
     ("danfoss-fc51", 0x0403, "hand mode"),
     ("optidrive-e3", 0x0000, "is not ready to run"),
-    ("optidrive-e3", 0x0100, "is not ready to run"),  # in the first edition of the guide: the motor runs
+    ("optidrive-e3", 0x0100, "is not ready to run"),  # status of a running motor, with swapped bytes
     ("invt-goodrive", 5, "has no mains"),
     ("yaskawa-a1000", 0x4022, "does not take its commands from the line"),
     ("yaskawa-a1000", 0x8002, "is not ready"),
@@ -393,8 +393,8 @@ def test_error_of_a_refused_start_names_the_reason(model: str, status: int, sent
     assert all(frame[-5:] == "04 76" for frame in sent(found))
 
 
-def test_running_optidrive_with_the_old_status_word_is_not_reported_as_stopped() -> None:
-    # the first edition of the drive's guide says: "high byte 1: running"
+def test_a_running_optidrive_with_swapped_bytes_does_not_seem_stopped() -> None:
+    # The guide's first edition prints the two bytes in the opposite order: there 0100H means running.
     found = wire("optidrive-e3", 0x0100, output_frequency=20.0)
     assert found.drive.state().condition is Condition.DECELERATING
     found = wire("optidrive-e3", 0x0000)
@@ -536,7 +536,7 @@ def test_a_family_with_its_own_control_words_sends_its_own_stop_word() -> None:
     assert sent(found) == [DELTA + "00 06"]
 
 
-def test_verbs_whose_control_word_a_family_omits_are_unsupported() -> None:
+def test_a_verb_without_a_control_word_is_unsupported() -> None:
     control = numbered({"forward": 1, "stop": 0, "reset_fault": 9})
     drive: Any = type("Short", (Goodrive,), {"control": control})(1, confirmed=1)
     drive.commanded = 40.0
@@ -563,7 +563,7 @@ def test_invalid_control_words_of_a_family_are_reported(words: Mapping[str, int]
     assert any(each.startswith(mistake) for each in wrong.value.mistakes)
 
 
-def test_control_words_made_of_bits_cannot_be_renumbered() -> None:
+def test_a_control_register_of_whole_numbers_cannot_have_bits() -> None:
     with pytest.raises(DeclarationError, match="its words are whole numbers"):
         type("Bits", (Goodrive,), {"control": command(0x2000, IntFlag("Bits", {"forward": 1, "stop": 2}))})
 

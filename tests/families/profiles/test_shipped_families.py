@@ -484,8 +484,11 @@ def test_unknown_profile_in_a_family_file_is_reported(tmp_path: Path) -> None:
         load(tmp_path, f'{HEAD}profile = "profdrive"\n[reading]\nspeed = {{ at = 1 }}\n')
 
 
-def test_adjacent_registers_are_read_in_one_request_if_the_manual_allows_it() -> None:
+def test_the_delta_vfd_el_file_limits_the_registers_of_a_read() -> None:
     assert shipped_family("delta-vfd-el").most_registers
+
+
+def test_the_polled_registers_of_an_acs355_are_all_readings() -> None:
     assert {register.access for register in shipped_family("abb-acs355").readings()} == {Access.READING}
 
 

@@ -95,7 +95,7 @@ VARIANTS = (  # for `fast_drives`: family, framing, baud rate
     (YD1000, Framing.RTU, 1_000_000),
 )
 REASONS = {str(each) for each in Status} - {str(Status.OK)}
-TIMEOUT = 0.02  # s; the client's shortest timeout, used after fast replies
+TIMEOUT = 0.02  # s; shortest reply timeout that a client learns from fast replies
 LATEST = 3 * TIMEOUT
 
 

@@ -43,7 +43,7 @@ class Kind:
     makes: Mapping[str, Any] = field(default_factory=dict)
     halts: tuple[str, ...] = ("stop",)
     own_address: int | None = None  # address of the register that holds the drive's own address
-    live: int = 3  # function code whose replies change while the motor turns
+    live: int = 3  # function code of the reads to which `turning` applies
 
 
 def _writes(function: int, start: int, judge: Callable[[int], bool]) -> Judge:

@@ -134,7 +134,7 @@ def typed(table: str) -> set[tuple[str, str, str, str, float | None]]:
     return found
 
 
-# Readings that both Delixi protocols have, as a table for `typed`.
+# Readings of both Delixi protocols, in the format that the function `typed` parses.
 DELIXI_MONITORS = """
 01F4 output_frequency     0.01 Hz
 01F5 reference_frequency  ? Hz

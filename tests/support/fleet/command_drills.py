@@ -38,7 +38,7 @@ class CommandRecord(NamedTuple):
     drive: str
     raw: int | None
     way: str
-    offered_s: float  # time at which the command was offered, monotonic, in s
+    offered_s: float  # monotonic time in s of the client's request
     told: CommandOutcome
     sent: int  # how often the drive received the command
 

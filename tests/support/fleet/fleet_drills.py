@@ -316,7 +316,7 @@ def drilled(folder: Path, lines: int = 12, seed: int = 1) -> Iterator[FleetDrill
         yield drill
 
 
-LOOK_S = 0.25  # seconds between queries; one query uses as much CPU as a gateway does in seconds
+LOOK_S = 0.25  # pause in s before each query of the state, which needs much CPU time
 
 
 def fleet_status(environment: Mapping[str, str]) -> dict[str, Any]:

@@ -45,7 +45,7 @@ def live(
     observer: socket.socket, lease: float, guard: float, timer: float, beyond: float, ports: list[str]
 ) -> None:
     mastership = Mastership(guard)
-    mastership.guard_s = timer  # now read only by the kernel's timer
+    mastership.guard_s = timer  # from here on, only the kernel's timer reads `guard_s`
     drives = [
         PolledDrive(Counted(1, name=f"drive-{n}"), (Polled(Counted.number, None),)) for n in range(len(ports))
     ]

@@ -98,7 +98,7 @@ def apply(port: str, file: str, report: str) -> None:
 
 
 def main() -> None:
-    await_turns(setattr, dict.__setitem__)  # a write may wait for more than a second on a busy machine
+    await_turns(setattr, dict.__setitem__)  # lets writes wait longer than 1 s, for busy machines
     for line in sys.stdin:
         process = os.fork()
         if process == 0:

@@ -158,7 +158,7 @@ class SecuredFleet:
         self.servers = servers
         self.hall = SerialHall(6)
         self.running: dict[str, subprocess.Popen[bytes]] = {}
-        # gateway: arguments with which `start` was called
+        # arguments of `start`, by gateway name
         self._started: dict[str, tuple[tuple[str, str], dict[str, str]]] = {}
         self._folder = folder
         (folder / "plant.toml").write_text(self.hall.plant())

@@ -93,7 +93,8 @@ class Story:
 
     def back_off_is_over(self) -> int:
         """Run until every drive was polled again after the fault; return that time in ns."""
-        cost = sum(drive.response_timeout for drive in self.drives) / 2  # s of timeouts per cycle, on average
+        # s per cycle that silent drives cost, estimated as half of all timeouts
+        cost = sum(drive.response_timeout for drive in self.drives) / 2
         longest = max(schedule.LONGEST_PAUSE_NS / S, cost / schedule.SILENT_SHARE)
         longest += Faults().away + polled_line.REOPEN_NS / S + poller.LOOK_NS / S
         ended = self.clocked.now
@@ -150,8 +151,8 @@ def _longest_gap(rows: Sequence[Row]) -> float:
 Delay = Callable[[float], float]
 
 SECONDS = 150.0  # duration of a run; longer than the 120 s for which a line remembers pending requests
-TAIL = 20.0  # s; every drive must reply during these last seconds plus TURNS times the delay
-TURNS = 20
+TAIL = 20.0  # s; last part of a run, in which every drive must reply
+TURNS = 20  # factor of a path's delay that is added to TAIL
 
 
 class PathWire(ClockedWire):
@@ -198,7 +199,7 @@ def stalling(longest: float) -> Delay:
     stalls = [(begin, begin + random.uniform(0.5, 1.0) * longest) for begin in begins]
 
     def delay(now: float) -> float:
-        now -= 1000.0  # clocked lines start at 1000 s, delays at 0
+        now -= 1000.0  # a run starts at 1000 s on the line's clock
         return max((end - now for begin, end in stalls if begin <= now < end), default=0.0)
 
     return delay
