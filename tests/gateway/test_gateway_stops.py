@@ -202,7 +202,7 @@ def test_a_stop_with_a_truncated_body_is_sent(gateway: Served) -> None:
 
 
 @pytest.mark.slow
-def test_a_stop_without_the_right_is_not_sent(tmp_path: Path) -> None:
+def test_a_stop_by_a_client_without_the_right_to_stop_is_not_sent(tmp_path: Path) -> None:
     with served(tmp_path, MAY.replace('stop = "anyone"\n', "")) as gateway, calling(gateway) as client:
         gateway.start("pump-1", "pump-2")
         client.sendall(STOP + UNREADABLE["late"])

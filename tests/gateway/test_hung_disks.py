@@ -269,7 +269,9 @@ def test_a_hanging_ledger_and_audit_log_are_reported(tmp_path: Path, monkeypatch
 
 
 @pytest.mark.long
-def test_hanging_page_files_delay_no_other_request(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_page_files_on_a_hanging_disk_delay_no_other_request(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     go_on, read = threading.Event(), Path.read_bytes
 
     def read_bytes(path: Path) -> bytes:

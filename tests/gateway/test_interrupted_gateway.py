@@ -67,7 +67,7 @@ def falls_silent(drive: Counting) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("step", first_in_ci(151, 53))
-def test_gateway_interrupted_at_any_bytecode_ends(drive: Counting, tmp_path: Path, step: int) -> None:
+def test_a_gateway_interrupted_at_any_bytecode_ends(drive: Counting, tmp_path: Path, step: int) -> None:
     """Raise KeyboardInterrupt before every `step`th bytecode of the main thread, from start to end."""
     plant = Plant.load(tmp_path / "plant.toml")
 

@@ -191,7 +191,7 @@ def test_a_port_that_is_missing_after_a_reload_is_reported(tmp_path: Path) -> No
         until(lambda: gateway.frame()["lines"]["roof"]["lost"] is None)
 
 
-def test_a_reload_applies_the_rights_and_host_names_of_serve(tmp_path: Path) -> None:
+def test_a_reload_applies_changed_rights_and_host_names(tmp_path: Path) -> None:
     with served(tmp_path, f'[serve]\nnames = ["old.example"]\nlisten = "localhost:1"\n{MAY}') as gateway:
         gateway.await_state("pump-1", "stands")
         assert gateway.get("/health", host="old.example").status == 200
@@ -268,7 +268,9 @@ def test_a_token_removed_from_the_file_is_invalid_after_a_reload(tmp_path: Path)
 
 
 @pytest.mark.long
-def test_values_before_a_reload_are_not_shown_after(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_values_polled_before_a_reload_are_not_shown_after_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """After the reload, the name may mean another drive, and this drive may be silent."""
     monkeypatch.setattr(drive_reads, "PAUSE_S", 0.0)
     with served(tmp_path, MAY) as gateway:

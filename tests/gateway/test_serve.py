@@ -46,7 +46,7 @@ UNITS = sorted((Path(__file__).parents[2] / "packaging").glob("*.service"))
 
 
 @pytest.mark.long
-def test_serve_notifies_the_service_manager_of_ready_alive_and_stopping(tmp_path: Path) -> None:
+def test_the_service_manager_is_notified_that_the_gateway_is_ready_alive_or_stopping(tmp_path: Path) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(tmp_path / "notify"))
         manager.settimeout(PATIENCE)
@@ -165,7 +165,7 @@ def test_a_stop_does_not_wait_until_the_log_is_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_serve_with_tls_answers_over_https(tmp_path: Path) -> None:
+def test_a_gateway_with_tls_answers_over_https(tmp_path: Path) -> None:
     certificate(tmp_path, "own")
     serve = '[serve]\nlisten = "127.0.0.1:0"\ncertificate = "own.pem"\nkey = "own.key"\ntokens = "tokens"\n'
     (tmp_path / "tokens").write_text(f"anna stop {digest('secret')}\n")
@@ -196,7 +196,7 @@ def test_an_http_port_in_use_is_reported_in_one_sentence(tmp_path: Path) -> None
     )
 
 
-def test_serve_check_reports_mistakes_in_the_plant_file(run: Run, tmp_path: Path) -> None:
+def test_the_command_serve_check_reports_mistakes_in_the_plant_file(run: Run, tmp_path: Path) -> None:
     plant = written(tmp_path, '[serve]\nlisten = "localhost:80"\n')
     assert run("serve", "--check", plant.path) == (
         0,

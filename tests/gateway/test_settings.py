@@ -209,9 +209,7 @@ def test_a_drive_name_with_a_star_is_not_read_as_a_pattern(tmp_path: Path) -> No
         ('family.invt-che = ["start"]', "family invt-che: ['start'] is not a table with write, verbs"),
     ],
 )
-def test_an_entry_of_serve_may_without_a_matching_drive_is_refused(
-    tmp_path: Path, may: str, sentence: str
-) -> None:
+def test_a_right_that_matches_no_drive_is_refused(tmp_path: Path, may: str, sentence: str) -> None:
     with pytest.raises(PlantError) as wrong:
         read_settings(written(tmp_path, f"[serve.may]\n{may}\n", *NAMES), {})
     assert any(sentence in mistake for mistake in wrong.value.mistakes), wrong.value.mistakes

@@ -297,7 +297,7 @@ async def test_a_failure_of_a_supervised_function_is_raised_in_its_caller(failur
         await supervisor().within("work", 60, work)
 
 
-async def test_work_that_hangs_raises_hung_and_is_reported_until_later_work_succeeds() -> None:
+async def test_supervised_work_that_hangs_is_reported_until_later_work_succeeds() -> None:
     go_on = threading.Event()
     threads = supervisor()
     with pytest.raises(Hung, match=r"history: not done within 0.01 s; does the disk answer\?"):
@@ -324,7 +324,7 @@ async def test_the_supervisor_raises_an_error_if_no_thread_can_start(monkeypatch
     assert supervisor().under_way == []
 
 
-def test_work_with_a_time_limit_returns_its_result_or_raises_hung() -> None:
+def test_supervised_work_returns_its_result_or_raises_hung() -> None:
     go_on = threading.Event()
 
     def fail() -> None:

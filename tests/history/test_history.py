@@ -69,7 +69,9 @@ def test_a_history_returns_rows_in_the_order_of_recording(folder: Path, rows: li
 
 @pytest.mark.slow
 @COMPACTED
-def test_history_reads_the_given_series_in_the_given_time_range(folder: Path, rows: list[list[Row]]) -> None:
+def test_a_history_reads_the_given_series_in_the_given_time_range(
+    folder: Path, rows: list[list[Row]]
+) -> None:
     dice = random.Random(5)
     times = [row.time_ns for row in flat(rows)]
     with History(folder) as history:
@@ -301,7 +303,7 @@ def test_an_incomplete_end_of_a_closed_segment_is_reported(tmp_path: Path) -> No
             assert history.damage == told
 
 
-def test_export_without_duckdb_uses_pyarrow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_export_without_duckdb_uses_pyarrow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("duckdb", reason="needs duckdb")
     rows = [random_rows(number, NOON + number * 60 * SECOND, 200) for number in range(2)]
     record(tmp_path, rows)
@@ -347,7 +349,7 @@ def test_buckets_include_all_new_rows(tmp_path: Path, monkeypatch: pytest.Monkey
                 assert end - begin < 8 * SECOND or grid_of(begin, end, 4).is_of_tens
 
 
-def test_cache_of_unknown_series_is_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_cache_of_unknown_series_is_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(growing, "MOST_SERIES", 3)
     with SegmentWriter(tmp_path / "rows.arrows", METADATA, every=1e9) as writer, History(tmp_path) as history:
         writer.write(from_rows(random_rows(1, NOON, 200)))
@@ -424,7 +426,7 @@ def test_a_segment_of_version_0_1_with_too_many_names_is_damaged(tmp_path: Path)
 
 
 @pytest.mark.parametrize("value", [0.1, 1.7e308, -1.7e308])
-def test_mean_of_equal_values_is_this_value(value: float) -> None:
+def test_the_mean_of_equal_values_is_this_value(value: float) -> None:
     """Their sum is rounded, or exceeds the largest float."""
     gathered = Accumulator(grid_of(0, 10, 1))
     gathered.add_rows([1] * 1000, [value] * 1000, [1] * 1000)

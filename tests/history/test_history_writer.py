@@ -289,7 +289,7 @@ def test_a_compaction_error_with_invalid_utf_8_is_reported(
     until(is_told)
 
 
-def test_names_of_history_files_have_segment_numbers_and_times() -> None:
+def test_the_names_of_history_files_have_segment_numbers_and_times() -> None:
     name = file_name(7, 7, NOON + 1, NOON + 600 * SECOND)
     assert name == "00000007.20261121T120000Z-20261121T121000Z.parquet"
     assert file_name(7, 9, 0, 1) == "00000007-00000009.19700101T000000Z-19700101T000001Z.parquet"
@@ -394,7 +394,7 @@ async def historian_in(folder: Path) -> AsyncIterator[historian.Historian]:
         await made.close()
 
 
-def test_all_mistakes_in_the_table_history_are_reported_together() -> None:
+def test_all_mistakes_in_the_history_settings_are_reported_together() -> None:
     with pytest.raises(ValueError, match="invalid time") as failure:
         HistorySettings(keep="for ever", most="20", rotate="0 s")
     lines = str(failure.value).splitlines()
@@ -439,7 +439,7 @@ async def test_large_history_queries_run_outside_the_event_loop_or_are_refused(
 
 
 @pytest.mark.parametrize("kind", ["csv", "parquet"])
-async def test_exports_of_a_history_start_outside_the_event_loop(tmp_path: Path, kind: str) -> None:
+async def test_an_export_of_a_history_starts_outside_the_event_loop(tmp_path: Path, kind: str) -> None:
     """An export first reads the metadata of up to thousands of files."""
     readers: list[int] = []
 

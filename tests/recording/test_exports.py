@@ -134,7 +134,7 @@ def test_hdf5_has_the_rows_of_the_recording(tmp_path: Path) -> None:
         assert json.loads(file["metadata"][()]) == METADATA
 
 
-def test_time_in_a_group_of_mdf4_never_decreases_although_the_clock_was_set_back(
+def test_the_time_in_an_mdf4_group_never_decreases_although_the_clock_was_set_back(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from asammdf import MDF
@@ -153,7 +153,7 @@ def test_time_in_a_group_of_mdf4_never_decreases_although_the_clock_was_set_back
     assert sorted(found) == sorted(times)
 
 
-def test_exports_have_the_names_of_negative_values(tmp_path: Path) -> None:
+def test_an_export_has_the_names_of_negative_values(tmp_path: Path) -> None:
     import h5py
     from asammdf import MDF
 
@@ -168,7 +168,7 @@ def test_exports_have_the_names_of_negative_values(tmp_path: Path) -> None:
         assert json.loads(file["drives/pump/direction"].attrs["values"]) == names
 
 
-def test_error_for_an_unknown_suffix_lists_the_suffixes_of_exports(tmp_path: Path) -> None:
+def test_the_error_for_an_unknown_suffix_lists_the_suffixes_of_exports(tmp_path: Path) -> None:
     source = record(tmp_path / "run.arrows", rows(1), METADATA)
     with pytest.raises(ValueError, match=r"must end in \.arrows, \.csv, \.parquet, \.mf4, \.h5"):
         convert(source, tmp_path / "run.xls")
@@ -177,7 +177,7 @@ def test_error_for_an_unknown_suffix_lists_the_suffixes_of_exports(tmp_path: Pat
 @pytest.mark.parametrize(
     ("suffix", "library", "extra"), [(".mf4", "asammdf", "mdf"), (".h5", "h5py", "hdf5")]
 )
-def test_error_for_a_missing_library_names_the_extra_to_install(
+def test_the_error_for_a_missing_library_names_the_extra_to_install(
     suffix: str, library: str, extra: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     source = record(tmp_path / "run.arrows", rows(1), METADATA)
@@ -203,7 +203,7 @@ def test_an_export_refuses_rows_before_1970_or_after_2200(time_ns: int, suffix: 
 
 
 @pytest.mark.parametrize("suffix", [pytest.param(".mf4", marks=pytest.mark.slow), ".h5"])
-def test_export_keeps_an_existing_file_and_removes_an_incomplete_one(
+def test_an_export_keeps_an_existing_file_and_removes_an_incomplete_one(
     suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     source, target = record(tmp_path / "run.arrows", rows(1), METADATA), tmp_path / f"run{suffix}"
@@ -319,7 +319,7 @@ def test_two_interrupts_during_a_step_of_an_mdf4_export_leave_no_file(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".mf4", ".h5"])
-def test_interrupt_between_two_steps_of_an_export_leaves_no_file(
+def test_an_interrupt_between_two_steps_of_an_export_leaves_no_file(
     suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Ctrl-C comes when the main thread passes a step to the library's thread."""
@@ -347,7 +347,7 @@ def test_interrupt_between_two_steps_of_an_export_leaves_no_file(
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no limit for a file's size")
 @pytest.mark.parametrize("suffix", [".mf4", ".h5"])
-def test_full_disk_leaves_no_exported_file(suffix: str, tmp_path: Path) -> None:
+def test_a_full_disk_leaves_no_exported_file(suffix: str, tmp_path: Path) -> None:
     """HDF5 would crash the process if it noticed the failed write at 20,000 bytes."""
     import resource
 

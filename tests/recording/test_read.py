@@ -124,7 +124,7 @@ def test_a_writer_replaces_a_recording_only_when_asked(path: Path) -> None:
     assert sum(map(len, found)) == 0
 
 
-def test_repr_of_a_recording_shows_its_rows_drives_and_time_span(tmp_path: Path) -> None:
+def test_the_repr_of_a_recording_shows_its_rows_drives_and_time_span(tmp_path: Path) -> None:
     about = r"^<recording .*run\.csv: 4 rows of 2 drives, 3\.000 s from .*>$"
     path = record(tmp_path / "run.csv", [row(at, f"pump-{at % 2}", "speed", 1.0) for at in range(4)])
     assert re.match(about, repr(multidrop.open_recording(path)))

@@ -215,13 +215,13 @@ def test_a_long_parquet_file_has_its_rows_in_groups(tmp_path: Path, monkeypatch:
     assert [row for rows in open_recording(tmp_path / "a.parquet") for row in rows] == [*batch] * times
 
 
-def test_names_are_dictionary_encoded_in_parquet(tmp_path: Path) -> None:
+def test_the_names_in_a_parquet_file_are_dictionary_encoded(tmp_path: Path) -> None:
     group = pa.parquet.read_metadata(record(tmp_path / "a.parquet")).row_group(0)
     encodings = {group.column(at).path_in_schema: group.column(at).encodings for at in range(7)}
     assert all("RLE_DICTIONARY" in encodings[name] for name in ("drive", "register", "status"))
 
 
-def test_csv_file_has_the_documented_text(tmp_path: Path) -> None:
+def test_a_csv_file_has_the_documented_text(tmp_path: Path) -> None:
     with open_writer(tmp_path / "a.csv", METADATA) as writer:
         writer.write(example())
     assert (tmp_path / "a.csv").read_text(encoding="utf-8").splitlines() == [
@@ -236,7 +236,7 @@ def test_csv_file_has_the_documented_text(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "a.csv.json").read_text(encoding="utf-8")) == METADATA
 
 
-def test_csv_without_metadata_is_read(tmp_path: Path) -> None:
+def test_a_csv_file_without_metadata_is_read(tmp_path: Path) -> None:
     path = record(tmp_path / "a.csv")
     (tmp_path / "a.csv.json").unlink()
     reader = open_recording(path)
@@ -425,7 +425,7 @@ def test_a_writer_may_be_closed_twice_and_later_writes_fail(tmp_path: Path, suff
 
 
 @pytest.mark.parametrize("act", [lambda path: open_writer(path, {}), open_recording])
-def test_error_for_parquet_without_pyarrow_names_the_extra_to_install(
+def test_the_error_for_parquet_without_pyarrow_names_the_extra_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, act: object
 ) -> None:
     assert callable(act)

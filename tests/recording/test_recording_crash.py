@@ -95,7 +95,7 @@ def test_a_file_cut_between_a_dictionary_and_its_batch_is_readable(tmp_path: Pat
         assert polars.read_ipc_stream(path)["drive"].to_list() == expected
 
 
-def test_names_of_a_batch_that_failed_are_written_with_the_next_one(tmp_path: Path) -> None:
+def test_the_names_in_a_failed_batch_are_written_with_the_next_one(tmp_path: Path) -> None:
     path = tmp_path / "a.arrows"
     with open_writer(path, METADATA) as writer:
         for room in (0, 100, 700):
@@ -117,7 +117,7 @@ def test_a_recording_appended_to_another_is_refused(tmp_path: Path) -> None:
         recorded(first)
 
 
-def test_names_that_exceed_the_memory_limit_are_reported_as_damage(
+def test_a_file_whose_names_exceed_the_memory_limit_is_reported_as_damaged(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The limit and the data are both smaller than in practice, by a factor of 256."""
@@ -160,7 +160,7 @@ def test_a_long_incomplete_line_of_a_csv_file_is_skipped(tmp_path: Path) -> None
     assert (reader.truncated, [*chain.from_iterable(reader)]) == (200_000, list(counting(ROWS)))
 
 
-def test_repaired_recording_is_opened_by_pyarrow_and_polars(tmp_path: Path) -> None:
+def test_a_repaired_recording_is_opened_by_pyarrow_and_polars(tmp_path: Path) -> None:
     path = tmp_path / "a.arrows"
     lengths = record(path, 3)
     os.truncate(path, lengths[3] - 9)
@@ -175,7 +175,7 @@ def test_repaired_recording_is_opened_by_pyarrow_and_polars(tmp_path: Path) -> N
 
 
 @table("suffix", FORMATS)
-def test_repair_leaves_a_whole_recording_unchanged(tmp_path: Path, suffix: str) -> None:
+def test_a_repair_leaves_a_whole_recording_unchanged(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
     record(path, 2)
     before = path.read_bytes()
@@ -443,7 +443,7 @@ def test_a_file_with_other_columns_is_refused_as_a_recording(tmp_path: Path, suf
 
 
 @pytest.mark.parametrize("uses_dictionary", [True, False])
-def test_parquet_file_that_unpacks_to_gigabytes_is_refused(
+def test_a_parquet_file_that_unpacks_to_gigabytes_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, uses_dictionary: bool
 ) -> None:
     """Limits and data are smaller than in practice by the same factor."""
@@ -476,7 +476,7 @@ def test_arrow_files_with_compressed_batches_are_refused(tmp_path: Path) -> None
         recorded(path)
 
 
-def test_error_for_a_damaged_csv_line_names_the_line(tmp_path: Path) -> None:
+def test_the_error_for_a_damaged_csv_line_names_the_line(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     record(path, 1)
     lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
@@ -486,7 +486,7 @@ def test_error_for_a_damaged_csv_line_names_the_line(tmp_path: Path) -> None:
             recorded(path)
 
 
-def test_error_for_damaged_csv_metadata_names_the_file(tmp_path: Path) -> None:
+def test_the_error_for_damaged_csv_metadata_names_the_file(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     record(path, 1)
     for damage in ("", "{", "[]"):

@@ -372,7 +372,7 @@ def test_triggers_beyond_the_limit_of_open_recordings_are_counted(writer: Trigge
     assert writer.dropped == 3
 
 
-def test_trigger_recording_keeps_only_the_rows_of_the_pre_trigger_time(writer: TriggeredWriter) -> None:
+def test_a_trigger_recording_keeps_only_the_rows_of_the_pre_trigger_time(writer: TriggeredWriter) -> None:
     for at in range(1000):
         writer.write(batch(at, at + 1))
     assert len(writer._before) < 40

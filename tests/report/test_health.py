@@ -128,7 +128,7 @@ def test_a_negative_value_is_shown_by_its_name(tmp_path: Path) -> None:
         ("LONGEST_NAME", 5, "a name has 7 bytes: names in a recording have at most 5"),
     ],
 )
-def test_recording_too_large_to_draw_raises_value_error(
+def test_a_recording_too_large_to_draw_raises_value_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str, value: int, mistake: str
 ) -> None:
     path = record(tmp_path / "it.arrows", [row(at, f"pump-{at:02}", "x", at) for at in range(20)], {})
@@ -154,7 +154,7 @@ def test_the_response_delay_excludes_the_time_of_the_request(look: Recording) ->
     assert fan.quantile(1.0) == pytest.approx(0.021)
 
 
-def test_reply_that_may_answer_a_lost_request_has_no_response_delay(tmp_path: Path) -> None:
+def test_a_reply_that_may_answer_a_lost_request_has_no_response_delay(tmp_path: Path) -> None:
     rows = [row(tick / 10, "pump", "fault", 0.0, ms=10.0) for tick in range(10)]
     rows += [row(1.0, "pump", "fault", None, "no reply"), row(1.0, "pump", "fault", 0.0, ms=488.0)]
     rows += [

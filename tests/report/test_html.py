@@ -53,7 +53,7 @@ def test_the_report_is_one_self_contained_page(look: Recording) -> None:
 
 
 @pytest.mark.usefixtures("_unpainted")
-def test_names_with_html_markup_are_escaped_in_the_report(tmp_path: Path) -> None:
+def test_drive_names_with_html_markup_are_escaped_in_the_report(tmp_path: Path) -> None:
     rows = [row(at, "<script>&", "output_frequency", at) for at in range(3)]
     look = load(record(tmp_path / "<b>.arrows", rows))
     for page in (report_page(look), plot_page(look, plot(look)[0])):
@@ -63,7 +63,7 @@ def test_names_with_html_markup_are_escaped_in_the_report(tmp_path: Path) -> Non
 
 @pytest.mark.slow
 @pytest.mark.long
-def test_names_in_any_alphabet_are_drawn(tmp_path: Path) -> None:
+def test_drive_names_in_any_alphabet_are_drawn(tmp_path: Path) -> None:
     with open_writer(tmp_path / "it.arrows", METADATA) as writer:
         writer.write(example())
     loaded = load(tmp_path / "it.arrows")
@@ -244,7 +244,9 @@ def test_the_statistics_of_a_test_step_equal_those_computed_with_pandas(tmp_path
 
 
 @pytest.mark.parametrize("set_by_s", [-3600.0, -3.0, 3600.0])
-def test_figures_of_a_step_do_not_change_if_the_clock_is_set(tmp_path: Path, set_by_s: float) -> None:
+def test_the_statistics_of_a_test_step_do_not_change_if_the_clock_is_set(
+    tmp_path: Path, set_by_s: float
+) -> None:
     recorded_run(tmp_path / "run.arrows")
     recorded_run(tmp_path / "set.arrows", set_by_s)
     run, other = load(tmp_path / "run.arrows"), load(tmp_path / "set.arrows")
@@ -254,7 +256,7 @@ def test_figures_of_a_step_do_not_change_if_the_clock_is_set(tmp_path: Path, set
 
 
 @pytest.mark.slow
-def test_plot_marks_the_start_of_each_step(tmp_path: Path) -> None:
+def test_a_plot_marks_the_start_of_each_step(tmp_path: Path) -> None:
     from multidrop.report.style import day
 
     recorded_run(tmp_path / "run.arrows")

@@ -232,7 +232,7 @@ def test_a_state_that_lasts_one_row_is_drawn(tmp_path: Path) -> None:
     assert sum(bars.get_edgecolor()[0][:3]) < 1.5  # the edge is darker than a medium grey
 
 
-def test_each_bit_of_a_status_register_has_a_lane_of_its_own(tmp_path: Path) -> None:
+def test_each_bit_of_a_status_register_is_drawn_in_its_own_row(tmp_path: Path) -> None:
     rows = [row(at, "yd", "status", value) for at, value in enumerate((0, 16, 18, 2, 2 + 64, 1e308, 0.5, 0))]
     (axes,) = plot(states(tmp_path, rows))[0].axes
     assert drawn(axes) == {  # bars start at 1 s, when the first bit is set
@@ -255,7 +255,7 @@ def test_states_that_change_too_fast_to_be_drawn_hide_no_fault(tmp_path: Path) -
 
 
 @pytest.mark.long
-def test_state_lanes_that_do_not_fit_into_a_panel_are_counted(tmp_path: Path) -> None:
+def test_rows_of_states_that_do_not_fit_into_a_plot_are_counted(tmp_path: Path) -> None:
     bits = {f"B{bit}": 1 << bit for bit in range(16)}
     drives = [f"yd{number}" for number in range(80)]
     meaning = {"unit": "", "values": bits, "bits": True}

@@ -443,7 +443,7 @@ def _used(call: re.Match[str]) -> str:
 # ---- the commands of a gateway whose lines are polled by a fleet ----
 
 NOT_STARTED = "the stop was NOT sent: the fleet's part has not started; use the hard-wired stop"
-WHOLE = "the fleet"  # key of the only result of FleetStops.stop
+WHOLE = "the fleet"  # key of a stop's result that concerns all drives
 
 
 class FleetStops(Commands):

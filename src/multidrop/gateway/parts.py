@@ -180,8 +180,8 @@ class LiveParts:
     async def replace(self, wanted: Mapping[str, Any], plant: Plant) -> None:
         """Use the settings of a changed plant file; `wanted` has them by part.
 
-        Parts with unchanged settings continue. The others are closed, and built again if they are in
-        `wanted`. If one cannot be opened, start the previous parts again, and raise ValueError.
+        Parts with unchanged settings continue. Changed and removed parts are closed, and then changed and new
+        parts are built. If one cannot be opened, start the previous parts again, and raise ValueError.
         """
         self._replaced = {name: one for name, one in self._settings.items() if wanted.get(name) != one}
         await self._drop([*self._replaced], END_S)

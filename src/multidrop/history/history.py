@@ -98,8 +98,8 @@ class History:
         """Return the rows of the series (None: all series) with begin <= time < end (None: no limit).
 
         The rows come in the order of recording. The unit of a register, or the names of its values, may have
-        changed within the range. Rows from before such a change then have another register name, such as
-        "motor_load [A]", so they are a separate column in wide tables. `metadata` describes both names. The
+        changed within the range. Rows with an earlier unit then have another register name, such as
+        "motor_load [A]", so `wide()` has a separate column for them. `metadata` describes both names. The
         result is a recording like that of `multidrop.open_recording`: `to_pandas()`, `to_polars()`, `wide()`,
         batches of rows, Arrow.
         """

@@ -117,7 +117,7 @@ class Sources:
     def known(self, found: Listing, begin: int, end: int) -> dict[int, FileUnits]:
         """Return the units of the registers in each file that may have rows in this range of time.
 
-        The key is the file's number. Raises Replaced if a file no longer exists.
+        The key is the number of the file's segment. Raises Replaced if a file no longer exists.
         """
         files = {number: file for number, file in found.rows.items() if file.may_have(begin, end)}
         unread = [file for number, file in files.items() if number not in self._known]

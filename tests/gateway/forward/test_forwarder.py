@@ -50,7 +50,7 @@ def clocked(tmp_path: Path) -> Iterator[Clocked]:
     made.spool.close()
 
 
-def test_newest_message_is_sent_before_the_backlog() -> None:
+def test_the_newest_message_is_sent_before_the_backlog() -> None:
     position, sent = SpoolPosition(3), []
     for newest in (9, 9, 9, *[12] * 6):
         sequence = position.next(newest)

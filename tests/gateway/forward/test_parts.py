@@ -124,7 +124,7 @@ def test_a_spool_folder_with_other_files_is_reported_in_one_sentence(tmp_path: P
 
 
 @pytest.mark.slow
-def test_gateway_uploads_all_rows_with_units_and_shows_no_secret(tmp_path: Path) -> None:
+def test_a_gateway_uploads_all_rows_with_units_and_shows_no_secret(tmp_path: Path) -> None:
     with web_server() as posted:
         (tmp_path / "token").write_text("T0K3N\n")
         serve = f'[serve.upload]\nurl = "{posted.url}"\ntoken = "token"\n'

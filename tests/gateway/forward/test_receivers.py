@@ -225,7 +225,7 @@ def test_a_database_that_was_down_for_two_hours_gets_each_row_once(tmp_path: Pat
 
 
 @pytest.mark.slow
-def test_broker_that_is_away_for_two_hours_gets_each_row_once(tmp_path: Path) -> None:
+def test_a_broker_that_is_away_for_two_hours_gets_each_row_once(tmp_path: Path) -> None:
     require_module("paho.mqtt.client")
     with ExitStack() as stack:
         broker = stack.enter_context(mosquitto(tmp_path))

@@ -67,7 +67,9 @@ def descriptors(pid: int) -> int:
 @pytest.mark.long
 @pytest.mark.parametrize("sent", usually(*SLOW), ids=["silent", "headers", "body"])
 @pytest.mark.parametrize("way", usually("http", "https"))
-def test_stop_is_accepted_while_500_slow_clients_are_connected(tmp_path: Path, sent: bytes, way: str) -> None:
+def test_a_stop_is_accepted_while_500_slow_clients_are_connected(
+    tmp_path: Path, sent: bytes, way: str
+) -> None:
     certificate(tmp_path, "own")
     (tmp_path / "tokens").write_text(f"anna stop {digest('secret')}\n")
     keys = 'certificate = "own.pem"\nkey = "own.key"\ntokens = "tokens"\n' if way == "https" else ""
@@ -205,7 +207,7 @@ def test_the_connection_that_is_idle_longest_is_closed_to_accept_a_new_one(
     assert not is_ended(pairs[MOST_OPEN + 1])  # the new connection itself stays open
 
 
-def test_new_connection_is_not_closed_before_its_first_request(
+def test_a_new_connection_is_not_closed_before_its_first_request(
     clock: Clock, pairs: list[tuple[socket.socket, socket.socket]]
 ) -> None:
     """The first request may be a stop, so a newer connection must not replace this one."""
@@ -295,7 +297,7 @@ async def test_a_stop_starts_before_the_waiting_reads() -> None:
     assert order[-1] == "later"
 
 
-def test_stop_is_answered_before_earlier_reads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_is_answered_before_earlier_reads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """20 clients send 5 requests each at the same time and read no answers."""
     order: list[str] = []
     come, go_on = threading.Event(), threading.Event()
@@ -333,7 +335,7 @@ def test_stop_is_answered_before_earlier_reads(tmp_path: Path, monkeypatch: pyte
     assert order.index("stop") < 10
 
 
-def test_unfinished_request_is_answered_with_503_at_shutdown(
+def test_an_unfinished_request_is_answered_with_503_at_shutdown(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(gateway_module, "GRACE_S", 0)

@@ -89,7 +89,9 @@ def test_commands_with_unknown_drives_verbs_or_options_are_refused(gateway: Serv
     assert (answer.status, answer.json["error"].startswith(sentence)) == (status, True)
 
 
-def test_answer_and_logs_have_the_commands_id(gateway: Served, caplog: pytest.LogCaptureFixture) -> None:
+def test_the_answer_and_the_logs_contain_the_id_of_a_command(
+    gateway: Served, caplog: pytest.LogCaptureFixture
+) -> None:
     caplog.set_level(logging.INFO)
     setpoint = {"drive": "pump-1", "register": "setpoint", "value": 40.0}
     written = gateway.command("/api/write", {**setpoint, "id": "order-7"}).json
@@ -286,7 +288,7 @@ def test_concurrent_exports_are_limited_and_do_not_delay_a_stop(tmp_path: Path) 
         ("series=%D0%BD%D0%B0%D1%81%D0%BE%D1%81.y&", "насос.y 2026-11-21T12-00-00Z to 2026-11-21T12-10-00Z"),
     ],
 )
-def test_file_name_of_an_export_has_the_drive_and_the_time_range(asked: str, name: str) -> None:
+def test_the_file_name_of_an_export_has_the_drive_and_the_time_range(asked: str, name: str) -> None:
     noon = 1_795_262_400_000
 
     class Quick(SlowHistory):

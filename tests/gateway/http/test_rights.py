@@ -221,7 +221,7 @@ def test_a_stop_from_the_gateways_own_page_or_a_program_is_sent(open_gateway: Se
     assert open_gateway.gateway.commands.called == before + 4
 
 
-def test_request_with_two_host_headers_is_refused(open_gateway: Served) -> None:
+def test_a_request_with_two_host_headers_is_refused(open_gateway: Served) -> None:
     connection = http.client.HTTPConnection("127.0.0.1", open_gateway.gateway.port)
     connection.putrequest("GET", "/health", skip_host=True)
     connection.putheader("host", "localhost")
@@ -361,7 +361,7 @@ def test_a_new_token_is_accepted_after_many_requests_with_a_revoked_token(tmp_pa
 
 
 @pytest.mark.slow
-def test_audit_log_names_the_caller_and_its_interface(tmp_path: Path) -> None:
+def test_the_audit_log_names_the_caller_and_its_interface(tmp_path: Path) -> None:
     with served(tmp_path, LOOPBACK_STOPS) as gateway:
         until(lambda: gateway.gateway.hub.taken > 0)
         writer = {"authorization": gateway.bearer(Right.WRITE)}

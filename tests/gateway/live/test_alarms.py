@@ -125,7 +125,9 @@ def test_polled_registers_decide_if_faults_show(model: str, polled: tuple[str, .
     assert can_show_fault(MODELS[model](1), polled) is is_seen
 
 
-def test_serve_check_warns_if_no_polled_register_can_show_a_fault(run: Run, tmp_path: Path) -> None:
+def test_the_command_serve_check_warns_if_no_polled_register_can_show_a_fault(
+    run: Run, tmp_path: Path
+) -> None:
     plant = written(tmp_path, "[serve]\n")
     status, _, errors = run("serve", "--check", plant.path)
     assert (status, errors) == (0, "")
@@ -295,7 +297,7 @@ def test_invalid_lines_of_the_alarm_file_are_ignored(change: Mapping[str, object
         assert alarm_in(line) is None
 
 
-def test_long_alarm_file_is_rewritten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_alarm_file_is_rewritten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("multidrop.gateway.live.alarms.MOST_BYTES", 2000)
     path = tmp_path / "alarms.jsonl"
     kept = started(path)
@@ -353,7 +355,7 @@ def test_acknowledged_alarms_survive_a_restart(tmp_path: Path, caplog: pytest.Lo
     assert f"alarm of pump-1 is over: fault: {words}" in caplog.messages
 
 
-def test_unwritable_alarm_file_is_reported_in_health(tmp_path: Path) -> None:
+def test_an_unwritable_alarm_file_is_reported_in_health(tmp_path: Path) -> None:
     (tmp_path / "alarms.jsonl").mkdir()
     with served(tmp_path) as gateway:
         until(lambda: "alarms are not kept" in gateway.get("/health").json["parts"].get("alarms", ""))

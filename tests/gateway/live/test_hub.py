@@ -97,7 +97,7 @@ def test_values_of_registers_are_unknown_before_their_first_request(hub: Hub) ->
     assert hub.state("pump-9") == "unknown"
 
 
-def test_time_of_the_newest_row_follows_a_clock_that_is_set_back(hub: Hub) -> None:
+def test_the_time_of_the_newest_row_follows_a_clock_that_is_set_back(hub: Hub) -> None:
     hub.take(rows((10, FREQUENCY, 25)))
     assert hub.time == UTC_0 + 10 * PERIOD
     hub.take(rows((11, FREQUENCY, 25), utc_0=UTC_0 - 3600 * SECOND))
@@ -157,7 +157,7 @@ def test_a_drive_is_silent_after_many_lost_replies_but_not_after_one(hub: Hub, c
     assert hub.state("pump-1") == "stands"
 
 
-def test_drive_that_answers_with_exceptions_is_not_silent(hub: Hub) -> None:
+def test_a_drive_that_answers_with_exceptions_is_not_silent(hub: Hub) -> None:
     columns = Columns(4)
     for register in range(4):
         layout = RowLayout(0, [Field(0, NumberFormat.U16, register, 1.0, 1.0)])
@@ -346,7 +346,7 @@ def test_a_fault_whose_name_becomes_known_later_raises_no_second_alarm() -> None
     assert [(one.time, one.text, one.ended) for one in events.shown()] == [(1, "overcurrent", None)]
 
 
-def test_number_of_ended_alarms_that_are_kept_is_limited() -> None:
+def test_the_number_of_ended_alarms_that_are_kept_is_limited() -> None:
     events = Alarms(since=7)
     for time in range(4000):
         events.look(time, "pump-1", Shown("fault", "a") if time % 2 else Shown("runs", None))
@@ -358,7 +358,7 @@ def test_number_of_ended_alarms_that_are_kept_is_limited() -> None:
     assert len(events.shown()) <= 21
 
 
-def test_a_message_to_the_page_has_null_for_overdue_or_failed_values(hub: Hub, clock: HubClock) -> None:
+def test_the_web_page_gets_null_for_overdue_or_failed_values(hub: Hub, clock: HubClock) -> None:
     hub.take(rows((10, FREQUENCY, 25), (10, CURRENT, 12), (11, CURRENT, Status.NO_REPLY)))
     for now, frequency, current in (
         (12, [25.0], [None, "no reply", 12.0]),  # a failed read is shown immediately
@@ -376,7 +376,7 @@ def test_a_message_to_the_page_has_null_for_overdue_or_failed_values(hub: Hub, c
         assert published_values(hub, "pump-1") == said  # the values that MQTT publishes
 
 
-def test_age_of_a_value_is_right_after_a_clock_change_or_a_sleep(hub: Hub, clock: HubClock) -> None:
+def test_the_age_of_a_value_is_correct_despite_a_clock_change_or_a_sleep(hub: Hub, clock: HubClock) -> None:
     """If the age were too small, the last value of a silent drive would look new."""
     hub.take(rows((10, FREQUENCY, 25), (20, FREQUENCY, Status.NO_REPLY)))
     asked_ns = UTC_0 + 10 * PERIOD

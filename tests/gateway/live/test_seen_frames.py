@@ -100,7 +100,7 @@ def test_a_repeated_command_with_the_same_message_number_is_refused(times: Times
     assert times.rule(8) == ""
 
 
-def test_old_messages_to_the_page_are_forgotten(times: Times) -> None:
+def test_the_numbers_of_old_messages_are_forgotten(times: Times) -> None:
     for n in range(1000):
         times.now_ns += 200_000_000
         times.frames.note(n)
@@ -168,7 +168,7 @@ def test_a_stop_is_sent_however_long_the_network_delayed_it(tmp_path: Path) -> N
         assert gateway.stands("pump-1")
 
 
-def test_a_start_is_not_sent_if_a_stop_followed_its_message(tmp_path: Path) -> None:
+def test_a_start_is_not_sent_if_its_sender_saw_no_values_since_a_stop(tmp_path: Path) -> None:
     """A proxy that repeats or delays a start must not start a motor after a stop."""
     with served(tmp_path, MAY) as gateway:
         writer = gateway.writer
@@ -267,7 +267,7 @@ def test_the_start_command_in_the_documentation_works_from_a_shell(tmp_path: Pat
         assert json.loads(ran.stdout)["text"] == "pump-1: start is done"
 
 
-def test_messages_to_the_page_contain_the_number_of_stops_of_each_drive(gateway: Served) -> None:
+def test_the_web_page_gets_the_number_of_stops_of_each_drive(gateway: Served) -> None:
     def stops() -> list[int]:
         return [gateway.frame()["drives"][name]["stops"] for name in ("pump-1", "pump-2")]
 

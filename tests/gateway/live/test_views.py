@@ -53,7 +53,7 @@ def gateway(shared: Served) -> Iterator[Served]:
     until(lambda: not shared.gateway.side_reads.under_way)
 
 
-def test_plant_description_combines_the_plant_file_and_the_manuals(gateway: Served) -> None:
+def test_the_plant_description_combines_the_plant_file_and_the_manuals(gateway: Served) -> None:
     plant = gateway.get("/api/plant").json
     assert (plant["name"], plant["history"]) == ("plant.toml", False)
     assert plant["may"] == {"role": "look", "write": [], "verbs": []}
@@ -87,7 +87,7 @@ def test_a_line_is_described_with_the_baud_rates_of_all_its_drives() -> None:
     assert [drive["speed"] for drive in told["drives"]] == ["38400 8N1", "9600 8N1", "9600 8N1"]
 
 
-def test_a_message_to_the_page_has_the_age_of_each_value(gateway: Served) -> None:
+def test_the_web_page_gets_the_age_of_each_value(gateway: Served) -> None:
     gateway.sims["pump-1"]["output_current"] = 12.3
     frame: dict[str, Any] = {}
 
@@ -421,14 +421,14 @@ def _at_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("_at_once")
-def test_identity_of_a_silent_drive_is_not_read() -> None:
+def test_the_identity_of_a_silent_drive_is_not_read() -> None:
     bus = AskedBus({})
     assert ask_all(bus, lambda name: name != "silent", "pump-1", "silent", "pump-2") == []
     assert bus.names == ["pump-1", "pump-2"] * 2
 
 
 @pytest.mark.usefixtures("_at_once")
-def test_known_identity_is_not_read_again() -> None:
+def test_a_known_identity_is_not_read_again() -> None:
     """No thread is started for a drive whose identity is known."""
     bus = AskedBus({})
     bus.known.add("pump-1")

@@ -328,7 +328,9 @@ def test_rows_of_the_json_address_map_are_encoded_one_by_one(monkeypatch: pytest
     assert encoded == [row._asdict()] * 3
 
 
-def test_no_address_map_without_a_modbus_server(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_plant_without_a_modbus_server_has_no_address_map(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(
         '[[line]]\nname = "a"\nport = "/dev/a"\n[[line.drive]]\nname = "b"\naddress = 1\nmodel = "yd1000"\n'

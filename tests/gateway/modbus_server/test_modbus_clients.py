@@ -83,7 +83,7 @@ def transactions(written: bytes) -> list[int]:
     return found
 
 
-async def test_answers_have_the_ids_of_their_requests_and_are_sent_when_ready() -> None:
+async def test_the_answers_have_the_ids_of_their_requests_and_are_sent_when_ready() -> None:
     async def slow(found: MbapRequest) -> bytes:
         await asyncio.sleep(found.transaction)
         return found.reply(bytes([found.transaction]))
@@ -215,7 +215,7 @@ async def test_a_long_queue_of_requests_is_answered_in_several_steps(
     assert transport.is_reading
 
 
-def test_number_of_requests_of_a_client_that_reads_no_answers_is_limited(
+def test_the_number_of_requests_of_a_client_that_reads_no_answers_is_limited(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(modbus_server, "MOST_UNTAKEN", 4096)

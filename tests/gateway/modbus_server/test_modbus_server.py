@@ -327,7 +327,9 @@ OUTCOMES = [
 
 
 @pytest.mark.parametrize(("failure", "expected"), OUTCOMES, ids=lambda one: str(one)[:40])
-def test_each_failed_write_has_its_exception_code(gateway: Gateway, failure: Any, expected: int) -> None:
+def test_a_client_gets_the_exception_code_for_its_failed_write(
+    gateway: Gateway, failure: Any, expected: int
+) -> None:
     gateway.commands.told = CommandResult(CommandOutcome.FAILED, str(failure), failure)
     assert code(gateway, 1, 6, CHE_SETPOINT, 5000) == expected
 
@@ -509,7 +511,9 @@ def test_an_unexpected_error_of_a_stop_is_logged(gateway: Gateway, caplog: pytes
     assert "a mistake of ours" in caplog.text
 
 
-def test_a_reply_of_a_wrong_length_is_no_reply(gateway: Gateway, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_reply_of_a_wrong_length_counts_as_no_reply(
+    gateway: Gateway, monkeypatch: pytest.MonkeyPatch
+) -> None:
     async def short(*request: object) -> list[int]:
         return [1]
 

@@ -148,7 +148,7 @@ def test_mistakes_in_the_modbus_settings_are_reported_with_their_place(tmp_path:
         ({"common": 0xFFF8}, "is not an address"),
     ],
 )
-def test_each_mistaken_modbus_setting_is_reported(settings: dict[str, object], sentence: str) -> None:
+def test_each_mistake_in_a_modbus_setting_is_reported(settings: dict[str, object], sentence: str) -> None:
     with pytest.raises(ValueError, match=r"^[\w\"]+") as mistake:
         ModbusSettings(**settings)  # type: ignore[arg-type]
     assert sentence in str(mistake.value)
@@ -160,7 +160,7 @@ def test_all_mistakes_in_the_modbus_settings_are_reported_together() -> None:
     assert len(str(mistake.value).splitlines()) == 4
 
 
-def test_listed_clients_may_connect_and_without_a_list_only_local_clients() -> None:
+def test_only_local_clients_may_connect_unless_others_are_listed() -> None:
     alone = ModbusSettings()
     assert [alone.may_connect(address) for address in ("127.0.0.1", "::1", "10.0.0.5")] == [True, True, False]
     named = ModbusSettings(listen="0.0.0.0:1502", clients=("10.0.0.0/24", "fe80::1"))

@@ -434,7 +434,7 @@ def test_each_mistake_in_the_settings_for_pc_tools_is_reported(
     assert sentence in mistake
 
 
-def test_on_windows_one_sentence_says_that_there_are_no_tool_ports(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_says_that_windows_has_no_ports_for_pc_tools(monkeypatch: pytest.MonkeyPatch) -> None:
     """Windows' event loop has no `add_reader`, which tool ports need."""
     monkeypatch.setattr("multidrop.gateway.modbus_server.tool_ports.sys.platform", "win32")
     with pytest.raises(ValueError, match=r"^Windows has no tool ports, because [^\n]*; use Linux$"):

@@ -74,7 +74,7 @@ def test_the_newest_values_are_retained(broker: Broker, listener: Listener, star
     }
 
 
-def test_stale_values_are_null_and_silent_drives_offline(listener: Listener, start: Start) -> None:
+def test_stale_values_are_null_and_silent_drives_are_offline(listener: Listener, start: Start) -> None:
     known, running = start()
     listener.wait_for(has("multidrop/pump-1/available", b"online"))
     known.hub.values[("pump-1", "output_frequency")] = None

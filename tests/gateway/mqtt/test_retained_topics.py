@@ -100,7 +100,7 @@ def test_topics_of_other_gateways_and_unknown_topics_are_kept(topic: str, payloa
     assert heard(GATEWAY, (topic, payload)) == []
 
 
-def test_number_of_retained_messages_that_are_examined_is_limited() -> None:
+def test_the_number_of_retained_messages_that_are_examined_is_limited() -> None:
     drives = [(f"works/{number}/available", b"online") for number in range(10 * MOST_KEPT)]
     assert len(heard(GATEWAY, *drives)) == 2 * MOST_KEPT
     left_behind = RetainedTopics("works", home_assistant=True)

@@ -257,7 +257,7 @@ def test_a_stop_method_called_on_the_wrong_object_still_stops_its_drive(
 
 
 @pytest.mark.slow
-def test_stop_calls_in_one_opc_ua_request_do_not_wait_for_each_other(gateway: Served, client: Any) -> None:
+def test_opc_ua_stop_calls_in_one_request_do_not_wait_for_each_other(gateway: Served, client: Any) -> None:
     gateway.start("pump-1")
     gateway.sims["pump-2"].deaf_until = float("inf")
     try:

@@ -22,7 +22,7 @@ def await_note(page: Any, text: str) -> None:
     until(page, f"document.querySelector('#fleet-age').textContent.includes({text!r})")
 
 
-def test_fleet_view_shows_gateways_lines_and_changes_of_masters(opened: Opener) -> None:
+def test_the_fleet_view_shows_gateways_and_lines_and_changes_of_masters(opened: Opener) -> None:
     page = opened("#/fleet")
     await_note(page, "Updated once a second")
     first, second, third = cells(page, "gateways")
@@ -43,7 +43,7 @@ def test_fleet_view_shows_gateways_lines_and_changes_of_masters(opened: Opener) 
     ]
 
 
-def test_fleet_tables_fit_a_small_screen(opened: Opener) -> None:
+def test_the_fleet_tables_fit_a_small_screen(opened: Opener) -> None:
     page = opened("#/fleet")
     await_note(page, "Updated once a second")
     tables = page.locator("#fleet .scroll")
@@ -79,14 +79,14 @@ def test_fleet_values_of_a_lost_gateway_are_marked_as_old(opened: Opener, gatewa
     assert "The gateway cannot be reached" in page.locator("#fleet-age").inner_text()
 
 
-def test_fleet_view_is_empty_before_the_fleet_was_seen(opened: Opener, gateway: FakeGateway) -> None:
+def test_the_fleet_view_is_empty_before_the_fleet_was_seen(opened: Opener, gateway: FakeGateway) -> None:
     gateway.fleet = {"age_s": None, "trouble": "no such server", "gateways": {}, "lines": {}, "moves": []}
     page = opened("#/fleet")
     await_note(page, "The fleet has not been seen yet: no such server")
     assert cells(page, "gateways") == []
 
 
-def test_fleet_view_shows_problems_of_gateways(opened: Opener, gateway: FakeGateway) -> None:
+def test_the_fleet_view_shows_problems_of_gateways(opened: Opener, gateway: FakeGateway) -> None:
     spool = {"bytes": 5, "lost": 7, "behind": None, "lag_s": None, "trouble": "the disk is full"}
     says = {"state": "working", "margin_s": 2.0, "trouble": "", "spool": spool}
     says["troubles"] = {"hall-1": "cannot be opened"}
@@ -100,7 +100,7 @@ def test_fleet_view_shows_problems_of_gateways(opened: Opener, gateway: FakeGate
     assert cells(page, "gateways")[0][5:9] == ["5 B", NONE, NONE, "7"]
 
 
-def test_fleet_view_draws_at_most_200_lines(opened: Opener, gateway: FakeGateway) -> None:
+def test_the_fleet_view_draws_at_most_200_lines(opened: Opener, gateway: FakeGateway) -> None:
     line = {"port": "socket://h:1", "master": "gw-1", "since_ms": 0}
     gateway.fleet = {"lines": {f"l{n}": line | ({"master": None} if n == 999 else {}) for n in range(1000)}}
     page = opened("#/fleet")
@@ -110,7 +110,7 @@ def test_fleet_view_draws_at_most_200_lines(opened: Opener, gateway: FakeGateway
     assert note == "1000 lines, 1 without a master; the first 200 are shown"
 
 
-def test_fleet_view_is_hidden_for_a_plant_without_a_fleet(opened: Opener, gateway: FakeGateway) -> None:
+def test_the_fleet_view_is_hidden_for_a_plant_without_a_fleet(opened: Opener, gateway: FakeGateway) -> None:
     gateway.plant_changes = {"fleet": False}
     page = opened()
     assert page.locator("nav a:visible").all_inner_texts()[-1] == "Log"
@@ -127,7 +127,9 @@ def test_key_6_opens_the_fleet_view(opened: Opener) -> None:
     assert page.locator("nav a[aria-current]").inner_text() == "Fleet"
 
 
-def test_stop_all_in_the_fleet_view_stops_only_the_plant(opened: Opener, gateway: FakeGateway) -> None:
+def test_the_stop_all_button_in_the_fleet_view_stops_only_the_plant(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     page = opened("#/fleet")
     stopall = page.locator("#stopall")
     assert stopall.inner_text() == "Stop this plant"
@@ -144,7 +146,7 @@ def test_stop_all_in_the_fleet_view_stops_only_the_plant(opened: Opener, gateway
     until(page, "document.querySelector('#stopall').textContent === 'Stop all'")
 
 
-def test_stop_all_stops_the_fleet_if_the_gateway_may(opened: Opener, gateway: FakeGateway) -> None:
+def test_the_stop_all_button_stops_the_fleet_if_the_gateway_may(opened: Opener, gateway: FakeGateway) -> None:
     gateway.plant_changes = {"fleet_stop": True}
     gateway.fleet_outcomes = {"hall-9.pump": {"done": True, "text": "stopped"}}
     page = opened("#/fleet")

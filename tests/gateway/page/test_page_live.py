@@ -231,7 +231,7 @@ FORBIDDEN = """for (const name of ['sessionStorage', 'localStorage'])
   Object.defineProperty(window, name, { get() { throw new DOMException('forbidden', 'SecurityError'); } })"""
 
 
-def test_page_reloads_itself_if_a_network_change_aborts_its_scripts(opened: Opener) -> None:
+def test_the_page_reloads_itself_if_a_network_change_aborts_its_scripts(opened: Opener) -> None:
     """Chromium aborts all requests if the network changes. In this test, it also forbids storage."""
     broken = []
 
@@ -253,7 +253,7 @@ def test_page_reloads_itself_if_a_network_change_aborts_its_scripts(opened: Open
     assert page.locator("#stopall").is_enabled()
 
 
-def test_page_without_scripts_says_that_stop_all_does_not_work(opened: Opener) -> None:
+def test_a_page_without_scripts_says_that_stop_all_does_not_work(opened: Opener) -> None:
     page = opened(live=False, prepare=aborting("**/page/data/api.js"))
     page.locator("#notice").get_by_text("Stop all does not work").wait_for()
     assert page.locator("#link.stale").inner_text() == "connecting"

@@ -38,7 +38,7 @@ def told(page: Any, title: str) -> None:
     page.get_by_role("heading", name=title, exact=True).wait_for()
 
 
-def test_stop_all_is_always_at_the_same_place_and_never_covered(opened: Opener) -> None:
+def test_the_stop_all_button_is_always_at_the_same_place_and_never_covered(opened: Opener) -> None:
     page = opened()
     for size, (wide, high) in SIZES.items():
         page.set_viewport_size({"width": wide, "height": high})
@@ -56,7 +56,9 @@ def test_stop_all_is_always_at_the_same_place_and_never_covered(opened: Opener) 
         assert 0 <= y <= y + height <= high
 
 
-def test_stop_all_works_on_a_phone_in_the_view_of_a_drive(opened: Opener, gateway: FakeGateway) -> None:
+def test_the_stop_all_button_works_on_a_phone_in_the_view_of_a_drive(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     page = opened("#/drives/filler-2", "phone", has_touch=True)
     page.locator("#panel.open h2").wait_for()
     page.locator("#stopall").tap()
@@ -112,7 +114,9 @@ def test_the_stop_key_works_as_soon_as_a_dialog_is_closed(opened: Opener) -> Non
     }""")
 
 
-def test_stop_all_accepts_a_click_right_after_a_dialog_closed(opened: Opener, gateway: FakeGateway) -> None:
+def test_the_stop_all_button_accepts_a_click_right_after_a_dialog_closed(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     """Even the second click of a double click is accepted, because it only opens the question."""
     page = opened("#/drives/pump-1")
     box = page.locator("#stopall").bounding_box()
@@ -129,7 +133,7 @@ def test_stop_all_accepts_a_click_right_after_a_dialog_closed(opened: Opener, ga
     assert gateway.posts == []
 
 
-def test_stop_all_works_while_another_dialog_is_open(opened: Opener, gateway: FakeGateway) -> None:
+def test_the_stop_all_button_works_while_another_dialog_is_open(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/drives/pump-1")
     box = page.locator("#stopall").bounding_box()
     page.get_by_role("button", name="Change frequency setpoint").click()

@@ -174,7 +174,7 @@ PAGE_TEXTS |= HtmlTexts().texts
 
 
 @pytest.mark.parametrize("script", SCRIPTS)
-def test_each_visible_text_of_a_script_is_in_the_catalogue(script: str) -> None:
+def test_each_visible_text_of_a_script_has_a_translation(script: str) -> None:
     found = literals(SCRIPTS[script])
     assert strangers(SCRIPTS[script]) == []
     assert {one.text for one in found if one.is_key} - TEXTS.keys() == set()
@@ -194,11 +194,11 @@ def test_each_visible_text_of_a_script_is_in_the_catalogue(script: str) -> None:
         't("Stop {what}", { what: "a drive" })',
     ],
 )
-def test_a_visible_text_outside_the_catalogue_is_found(script: str) -> None:
+def test_a_visible_text_without_a_translation_is_found(script: str) -> None:
     assert strangers(script) != []
 
 
-def test_each_text_of_the_html_is_in_the_catalogue_of_translations() -> None:
+def test_each_text_of_the_html_has_a_translation() -> None:
     assert HtmlTexts().texts - TEXTS.keys() - NAMES == set()
 
 
@@ -455,7 +455,7 @@ def test_each_kind_of_alarm_has_its_shape_colour_word_and_trend_bar() -> None:
         assert f"\n  {kind}: " in words[words.index("ALARMS") :]
 
 
-def test_vendored_plot_library_has_its_licence() -> None:
+def test_the_included_plot_library_has_its_licence() -> None:
     licence = (PAGE / "vendor" / "uPlot-LICENSE").read_text("utf-8")
     script = (PAGE / "vendor" / "uPlot.iife.min.js").read_text("utf-8")
     assert "The MIT License" in licence

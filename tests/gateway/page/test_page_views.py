@@ -428,14 +428,16 @@ CHECK = """boxes => {
 
 
 @pytest.mark.usefixtures("many_drives")
-def test_number_of_selected_drives_is_limited_to_the_number_of_line_styles(opened: Opener) -> None:
+def test_the_number_of_selected_drives_is_limited_to_the_number_of_line_styles(opened: Opener) -> None:
     page = opened("#/trends?drive=pump-1&from=1764075600000&to=1764079200000")
     until(page, DRAWN)
     checked = page.evaluate(CHECK, "#picker [aria-label=Drives] input")
     assert checked == [True] * 24 + [False] * 7
 
 
-def test_time_before_the_start_is_not_shown_as_free_of_faults(opened: Opener, gateway: FakeGateway) -> None:
+def test_the_time_before_the_start_is_not_shown_as_free_of_faults(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     """The gateway started in the middle of the shown hour."""
     page = opened("#/trends?drive=pump-2&from=1764075600000&to=1764079200000")
     lanes = page.locator("#lane .bars")
@@ -522,7 +524,7 @@ DOTS = """async values => {
 }"""
 
 
-def test_value_between_two_gaps_is_drawn_as_a_dot(opened: Opener) -> None:
+def test_a_value_between_two_gaps_is_drawn_as_a_dot(opened: Opener) -> None:
     """The plot has ten points a second. The register is read once a second and has three values."""
     page = opened()
     nothing = [None] * 9

@@ -125,8 +125,8 @@ class ModbusClient(asyncio.Protocol):
     def pause_writing(self) -> None:
         """Note that the client does not read its answers.
 
-        asyncio calls this when its write buffer is full. From now on, no request of this client is answered,
-        but further requests are received.
+        asyncio calls this when its write buffer is full. From now on the client's reads wait, but its writes,
+        which may be stops, still start on arrival.
         """
         self._stalled_since = self._port.clock()
 
