@@ -24,6 +24,7 @@ class LineError(BusError, OSError):
         self.port = port
         self.reason = reason
         self.is_sent = False  # whether at least a part of the request was sent
+        self.received = b""  # the bytes that came after the request
 
 
 class PortLost(LineError):

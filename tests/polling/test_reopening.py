@@ -18,11 +18,11 @@ from toy import Status, Toy
 
 from multidrop import poller as poller_module
 from multidrop.bus import Bus
-from multidrop.core import Framing, Message, build_reply, parse_request
+from multidrop.core import Framing, Message, build_reply, build_request, parse_request
 from multidrop.drive import Drive, Script, insist, read
 from multidrop.drive.register import HOLDING, command, reading
 from multidrop.drive.verbs import CommandOutcome, verb
-from multidrop.errors import LineError, PollingFailed
+from multidrop.errors import LineError, PollingFailed, Unconfirmed
 from multidrop.families import InvtCHE
 from multidrop.poller import Poller
 from multidrop.polling import polled_line
@@ -162,11 +162,21 @@ def test_a_port_that_a_stop_has_reopened_is_not_dropped_as_lost(
     assert hall.port.queue is reopened is not None
 
 
+def good_reply(framing: Framing, request: Message) -> bytes:
+    """Return a register's address as its value, or the confirmation of a write."""
+    read = Message(1, 3, data=request.start.to_bytes(2), transaction=request.transaction)
+    return build_reply(framing, read if request.function == 3 else request)
+
+
 @contextmanager
 def server(
-    is_last: Callable[[int, int], bool], idle_s: float | None = None, closes: list[bytes] | None = None
+    is_last: Callable[[int, int], bool],
+    idle_s: float | None = None,
+    closes: list[bytes] | None = None,
+    framing: Framing = Framing.TCP,
+    reply: Callable[[Framing, Message], bytes] = good_reply,
 ) -> Iterator[str]:
-    """Serve Modbus TCP to one client at a time. Reads return the register's address; writes are echoed.
+    """Serve one client at a time.
 
     The server closes a connection after its nth request if `is_last(nth, address)` is True, or if no request
     comes for `idle_s` s. It closes the connection without a reply if the address is `DEADLY`. When it closes
@@ -176,11 +186,10 @@ def server(
 
         def serve(connection: socket.socket) -> None:
             for nth in count(1):
-                _, request = parse_request(Framing.TCP, connection.recv(64))
+                _, request = parse_request(framing, connection.recv(64))
                 if request is None or request.start == DEADLY:
                     return
-                read = Message(1, 3, data=request.start.to_bytes(2), transaction=request.transaction)
-                connection.sendall(build_reply(Framing.TCP, read if request.function == 3 else request))
+                connection.sendall(reply(framing, request))
                 if is_last(nth, request.start):
                     return
 
@@ -199,7 +208,8 @@ def server(
 
         thread = threading.Thread(target=accept, daemon=True)
         thread.start()
-        yield f"tcp://127.0.0.1:{listener.getsockname()[1]}"
+        scheme = "tcp" if framing is Framing.TCP else "socket"
+        yield f"{scheme}://127.0.0.1:{listener.getsockname()[1]}"
         listener.shutdown(socket.SHUT_RDWR)
     thread.join()
 
@@ -298,6 +308,11 @@ class Checked(Fragile):
         yield from read(self.output_frequency)
 
 
+class CheckedRTU(Checked):
+    framings = (Framing.RTU,)
+    formats = {Framing.RTU: ("8N1",)}
+
+
 @pytest.mark.parametrize("is_polled", [False, True])
 def test_a_stop_is_sent_although_the_server_closes_the_connection_after_each_reply(is_polled: bool) -> None:
     """The check of the drive's family must not use up each new connection, and neither must polling."""
@@ -309,6 +324,28 @@ def test_a_stop_is_sent_although_the_server_closes_the_connection_after_each_rep
         else:
             stack.enter_context(Bus(port)).attach(drive)
         assert drive.stop(seconds=PATIENCE).outcome is CommandOutcome.DONE
+
+
+@pytest.mark.parametrize("most", [1, 2])
+def test_a_stop_over_rtu_is_confirmed_although_the_server_closes_connections_early(most: int) -> None:
+    """On each new connection the confirmation may be an adapter's echo, until a read shows that it is not."""
+    drive = CheckedRTU(1)
+    with server(lambda nth, address: nth == most, framing=Framing.RTU) as port, Bus(port) as bus:
+        bus.attach(drive)
+        assert drive.stop(seconds=PATIENCE).outcome is CommandOutcome.DONE
+
+
+@pytest.mark.parametrize("is_alive", [False, True])
+def test_an_echo_before_the_connection_ends_does_not_confirm_a_stop(is_alive: bool) -> None:
+    """The adapter echoes each request. No write reaches the drive, which may still answer reads."""
+
+    def echo_and_reply(framing: Framing, request: Message) -> bytes:
+        is_answered = is_alive and request.function == 3
+        return build_request(framing, request) + (good_reply(framing, request) if is_answered else b"")
+
+    closing = server(lambda nth, address: True, framing=Framing.RTU, reply=echo_and_reply)
+    with closing as port, Bus(port) as bus, pytest.raises(Unconfirmed):
+        bus.attach(CheckedRTU(1)).stop(seconds=1)
 
 
 def test_a_stop_does_not_wait_for_the_poller_to_reopen_a_port(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -60,14 +60,21 @@ class EchoCheck:
             with suppress(DriveException, NoValue):
                 self._exchanges.values(drive, [register], attempts, insists=insists, timeout=timeout)
 
-    def probe(self, drive: Drive, *, insists: bool = False) -> None:
-        """Read a register once, to find out whether the adapter echoes requests.
+    def probe(self, drive: Drive, *, insists: bool = False) -> bool:
+        """Read a register once; return True if the drive answers and the adapter does not echo requests.
 
         A request of another client can look like an echo of our own. The core would then ignore the drive's
         confirmations of writes, because they are copies of our requests. A reply to this read prevents that.
+        With `insists`, first reopen a lost port: some servers close the connection after each reply.
         """
-        with suppress(*READ_FAILURES):
+        line = self._exchanges.line
+        try:
+            if insists and line.is_lost:
+                line.regain()
             self.read_any(drive, 1, insists=insists, timeout=WRITE_TIMEOUT)
+        except READ_FAILURES:
+            return False
+        return self._exchanges.has_answered(drive) and not line.has_echo
 
     def why_doubtful(self, drive: Drive) -> str:
         """Return why the reply to a write may be the adapter's echo; "" if the reply is the drive's own.

@@ -189,20 +189,28 @@ class Writer:
     ) -> Outcome:
         """Send a write once; return its outcome. A stop has no `Call` object."""
         request, asked = write_request(drive, register, raw), register.decode(raw)
-        what = _in_words(register, asked)
+        frame, what = build_request(drive.framing, request), _in_words(register, asked)
         is_setpoint = register.name == drive.setpoint_name
         take_back = drive.begin_setpoint() if is_setpoint else lambda: None
+        done = Outcome(drive.name, register, asked, Effect.DONE)
         with self._logged(drive, request, what, log, call):
             try:
                 completion = self._carry_out(drive, request, what, call, timeout)
             except Exception as failure:
                 if _is_unsent(failure):
                     take_back()
-                raise
-            outcome = self._outcome(drive, register, asked, completion, call)
-            is_unconfirmed = outcome.effect is Effect.UNCONFIRMED
-            if is_unconfirmed and build_request(drive.framing, request) in completion.raw:
-                self._echo.probe(drive, insists=call is None)
+                # a server may close the connection right after its reply to a stop
+                is_copy = call is None and isinstance(failure, LineError) and failure.received == frame
+                if not (is_copy and self._echo.probe(drive, insists=True)):
+                    raise
+                outcome = done
+            else:
+                outcome = self._outcome(drive, register, asked, completion, call)
+                is_copy = outcome.effect is Effect.UNCONFIRMED and frame in completion.raw
+                is_answered = is_copy and self._echo.probe(drive, insists=call is None)
+                if call is None and is_answered and completion.result == Failure.MAYBE_ECHO:
+                    outcome = done
+        is_unconfirmed = outcome.effect is Effect.UNCONFIRMED
         if outcome.effect is Effect.REFUSED:
             take_back()
         elif is_setpoint:

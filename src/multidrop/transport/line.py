@@ -389,7 +389,7 @@ class Line:
                 self._log.frames(exchange, found)
             if is_lost:
                 failure = self._failure(found, exchange, core)
-                failure.is_sent = found.sent_ns > 0
+                failure.is_sent, failure.received = found.sent_ns > 0, found.raw
         finally:  # reached even if Ctrl-C interrupts the exchange
             if core.called_off:
                 self._discard(core)
