@@ -277,12 +277,12 @@ def test_a_write_to_a_replayed_drive_lasts_until_the_next_captured_value(capture
     assert drive["output_frequency"] == 25.0
 
 
-def test_replay_of_a_drive_that_was_not_captured_is_silent(capture: Path) -> None:
+def test_a_replayed_drive_that_was_not_captured_is_silent(capture: Path) -> None:
     replay = Replay(capture, plant(Toy(1), Toy(2, name="other")))
     assert replay.drive(Toy(2, name="other")).answer(Message(2, 3, 1, 1), 0.0) is None
 
 
-def test_replay_refuses_a_capture_of_other_drives(capture: Path) -> None:
+def test_a_capture_of_other_drives_cannot_be_replayed(capture: Path) -> None:
     with pytest.raises(ValueError, match=r"hall\.pcapng has no exchange with other$"):
         Replay(capture, plant(Toy(2, name="other")))
 

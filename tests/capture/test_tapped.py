@@ -377,7 +377,9 @@ def test_a_flight_recorder_keeps_its_limit_of_memory(tmp_path: Path, monkeypatch
     assert seconds == list(range(seconds[0], 1201))
 
 
-def test_closing_a_recorder_writes_pending_anomalies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_recorder_writes_pending_anomalies_when_it_is_closed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     one_flight = Flight(tmp_path, monkeypatch)
     one_flight.pass_(3)
     one_flight.recorder.close()

@@ -103,7 +103,7 @@ def test_a_spool_in_a_new_folder_has_a_new_log_id(tmp_path: Path) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("step", first_in_ci(83, 1))
-def test_if_the_newest_file_is_cut_at_any_byte_no_earlier_message_is_lost(
+def test_no_earlier_message_is_lost_if_the_newest_file_is_cut(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, step: int
 ) -> None:
     """A power cut may leave a file without some of its last bytes, or leave a temporary file."""

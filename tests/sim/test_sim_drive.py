@@ -249,7 +249,9 @@ def every_register() -> list[tuple[Register[float], int]]:
 
 
 @table(("register", "at"), every_register())
-def test_encoded_number_is_made_of_address_table_and_register(register: Register[float], at: int) -> None:
+def test_fixed_values_are_computed_from_address_table_and_register(
+    register: Register[float], at: int
+) -> None:
     sim = EncodedDrive(Own(7))
     table, where = register.table, register.address + at
     numbers = {COIL: 1, DISCRETE: 2, HOLDING: 3, INPUT: 4}
@@ -332,7 +334,7 @@ def test_ramp_of_a_simulated_motor_does_not_depend_on_the_time_steps(motor: Moto
     assert motor.frequency == pytest.approx(20)
 
 
-def test_stop_of_a_simulated_motor_ramps_down_and_removes_the_voltage(turning: Motor) -> None:
+def test_a_stopped_simulated_motor_ramps_down_and_loses_its_voltage(turning: Motor) -> None:
     turning.stop()
     turning.run_to(102)
     assert turning.frequency == pytest.approx(20)
@@ -359,7 +361,7 @@ def test_simulated_motor_decelerates_to_zero_before_it_reverses(turning: Motor) 
     assert turning.frequency == pytest.approx(-40)
 
 
-def test_coast_removes_the_voltage_while_the_shaft_slows_down(turning: Motor) -> None:
+def test_a_coasting_motor_has_no_voltage_while_its_shaft_slows_down(turning: Motor) -> None:
     speed = turning.speed
     turning.coast()
     assert (turning.frequency, turning.current, turning.voltage) == (0, 0, 0)
@@ -408,7 +410,7 @@ def test_heatsink_warms_under_load_and_cools_at_rest(motor: Motor) -> None:
     assert motor.heatsink == pytest.approx(25, abs=0.01)
 
 
-def test_fault_of_a_simulated_motor_prevents_a_run_until_the_reset(turning: Motor) -> None:
+def test_a_simulated_motor_with_a_fault_starts_only_after_a_reset(turning: Motor) -> None:
     turning.trip(7)
     turning.run()
     turning.jog()
@@ -435,7 +437,7 @@ def test_run_time_of_a_simulated_motor_counts_only_while_it_runs(motor: Motor) -
     assert motor.run_seconds == 7200
 
 
-def test_advancing_a_simulated_motor_to_an_earlier_time_changes_nothing(motor: Motor) -> None:
+def test_a_simulated_motor_ignores_an_earlier_time(motor: Motor) -> None:
     motor.run()
     motor.run_to(4)
     motor.run_to(3)

@@ -300,7 +300,7 @@ def test_simulated_innovert_ibd_outputs_show_the_motors_state(ibd: Bench) -> Non
     assert ibd.read(3, 22) == [0x1800]
 
 
-def test_direction_bits_alone_reverse_a_running_simulated_innovert_ibd(ibd: Bench) -> None:
+def test_a_running_simulated_innovert_ibd_is_reversed_by_direction_bits_alone(ibd: Bench) -> None:
     assert ibd.write(0x2001, 2000) == 0
     # bits for reverse, for forward, and both bits together, which mean reverse
     for bits, direction in ((0x06, -1), (0x08, 1), (0x0C, -1)):
@@ -326,7 +326,7 @@ def test_jog_of_a_simulated_innovert_ibd_is_ended_only_by_a_stop(ibd: Bench) -> 
     assert ibd.motor.frequency == 50
 
 
-def test_trip_ends_a_jog_of_a_simulated_innovert_ibd(ibd: Bench) -> None:
+def test_a_trip_ends_a_jog_of_a_simulated_innovert_ibd(ibd: Bench) -> None:
     ibd.write(0x2001, 5000)
     ibd.write(0x2000, 3)
     ibd.sim.trip(1)
@@ -608,7 +608,7 @@ def test_simulated_yd1000_obeys_the_panel_while_bit_15_is_off(yd: Bench) -> None
     assert yd.motor.frequency == 30
 
 
-def test_trip_of_a_simulated_yd1000_freezes_only_1200h_and_1201h(yd: Bench) -> None:
+def test_a_trip_of_a_simulated_yd1000_freezes_only_1200h_and_1201h(yd: Bench) -> None:
     run_at(yd, 5000)
     yd.read(3, 0x1200)
     yd.write(0x1000, STOP | 1 << 12)  # emergency stop

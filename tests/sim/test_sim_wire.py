@@ -82,7 +82,9 @@ def test_simulated_rtu_reply_waits_t3_5_even_with_a_shorter_response_delay() -> 
     ],
     ids=lambda each: getattr(each, "model", None),
 )
-def test_simulated_silence_before_replies_is_the_familys(drive: Drive, request_: str, silence: float) -> None:
+def test_the_silence_before_a_simulated_reply_is_that_of_its_family(
+    drive: Drive, request_: str, silence: float
+) -> None:
     wire = Wire([simulated(drive, response_delay=0.0)])
     wire.receive(checksums.rtu(request_), 0.0)
     character = drive.settings.character
@@ -241,7 +243,7 @@ def test_idle_simulated_wire_has_no_next_wake_up_time() -> None:
     assert wire.wake is None
 
 
-def test_path_of_a_simulated_wire_that_is_not_open_raises_runtime_error() -> None:
+def test_the_path_of_a_closed_simulated_wire_raises_runtime_error() -> None:
     with pytest.raises(RuntimeError, match="not open"):
         _ = Wire([simulated(Own(1))], name="hall-1").path
 
@@ -359,7 +361,7 @@ def test_ascii_or_delixi_frame_is_complete_at_its_line_end(framing: Framing, tex
     assert frame.address == 1
 
 
-def test_colon_starts_a_new_text_frame() -> None:
+def test_a_colon_starts_a_new_text_frame() -> None:
     assert functions(Receiver(Framing.ASCII, CHARACTER, 1.0).feed(b"\xff:0106:01" + RUN, 0.0)) == [6]
 
 

@@ -23,7 +23,7 @@ def is_near(baudrate: int, wanted: int) -> bool:
 
 @pytest.mark.slow
 @USB
-def test_kernel_and_adapter_have_the_drives_port_settings(guest: Guest, kind: str) -> None:
+def test_the_kernel_and_the_adapter_use_the_requested_port_settings(guest: Guest, kind: str) -> None:
     facts = guest.run("settings", kind=kind, wanted=SETTINGS)
     for (baudrate, form), fact in zip(SETTINGS, facts, strict=True):
         assert fact["read"] == RIGHT

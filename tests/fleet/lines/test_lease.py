@@ -463,7 +463,7 @@ async def test_an_observer_ends_a_dead_session_when_its_own_clock_shows_the_expi
 
 
 @pytest.mark.parametrize("has_rival", [False, True])
-async def test_ending_a_dead_session_does_not_wait_for_a_bucket_without_a_leader(has_rival: bool) -> None:
+async def test_the_end_of_a_dead_session_does_not_wait_for_a_leaderless_bucket(has_rival: bool) -> None:
     """The server of the third lease record may have died with the gateway."""
     trial, _lease, observer = await watched()
     trial.pass_lease()

@@ -434,7 +434,7 @@ def test_a_second_hub_waits_until_the_first_one_has_left_the_database(empty: Pos
 
 
 @pytest.mark.slow
-def test_writing_fails_if_another_hub_has_changed_the_stored_position(empty: Postgres) -> None:
+def test_a_hub_stops_writing_if_another_hub_has_changed_the_stored_position(empty: Postgres) -> None:
     """Behind a connection pooler, several hubs may share one lock, so the database checks the position."""
     sink = PostgresSink(empty.where)
     sink.begin("then")

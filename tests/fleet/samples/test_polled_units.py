@@ -203,7 +203,7 @@ def test_each_unit_of_a_register_is_exported_as_a_column(kept: Path, tmp_path: P
 
 
 @pytest.mark.slow
-def test_opening_a_single_file_of_a_hub_is_refused(kept: Path) -> None:
+def test_a_single_file_from_a_hubs_folder_cannot_be_opened(kept: Path) -> None:
     with pytest.raises(ValueError, match="a file of `multidrop hub`: read its folder with"):
         multidrop.open_recording(min((kept / "rows").iterdir()))
 
