@@ -69,8 +69,8 @@ class SourceCheck:
     """Checks that no message of a gateway is missing or repeated.
 
     Each missing or repeated message is counted and logged as an error. It is counted once, even if the hub
-    reads messages again after a failure. A gateway numbers its messages; with a new spool folder it starts
-    again at 1, so the numbers are kept by gateway and id of the spool.
+    reads messages again after a failure. A gateway numbers its messages. With a new spool (the folder for
+    messages on its disk) it starts again at 1. So the numbers are kept by gateway and id of the spool.
     """
 
     def __init__(self, last: Mapping[str, int]) -> None:

@@ -235,10 +235,10 @@ async def keep_leaders(
 class Releases:
     """Decides which lines this gateway may hand over to other gateways now.
 
-    A handed-over line is polled by no gateway until the servers have stored two changes of its records: the
-    release by this gateway and the claim by the next one. Both need buckets with a leader. So this gateway
-    keeps polling a line while too few buckets have a leader. It also does so while a server is silent,
-    because buckets may lose their leaders for seconds when that server returns.
+    A line that is handed over has no master for a moment: this gateway's release must be stored, and then
+    the claim of the next gateway. The servers store both only in buckets with a leader. So this gateway keeps
+    polling a line while too few buckets have a leader. It also does so while a server is silent, because
+    buckets may lose their leaders for seconds when that server returns.
 
     `on_change` is called when the servers' state has changed.
     """
