@@ -428,6 +428,7 @@ CHANNEL = '[[line.drive.channel]]\nname = "{}"\nvalue = "output_frequency / 2"\n
         ('certificate = "cert.pem"\nkey = "plant.toml"', (), 'certificate = "cert.pem": there is no file'),
         ("port = 4840", (), "unknown key 'port'"),
         ("", ("a", "a.status"), 'drive "a.status" has the node id of a value of "a": choose another name'),
+        ("", ("a", "a.Stop.OutputArguments"), 'drive "a.Stop.OutputArguments" has the node id of a value of'),
         (CHANNEL.format("State"), ("a",), 'channel "State" of "a" has the node id of another value'),
         (CHANNEL.format("half"), ("a.half", "a"), 'drive "a.half" has the node id of a value of "a"'),
     ],

@@ -26,7 +26,7 @@ from multidrop.control.commands import JoinedStops
 from multidrop.gateway.commands import drives_of
 from multidrop.gateway.http.connections import listen
 from multidrop.gateway.http.rights import Caller, Right, Tokens, caller_with, is_loopback
-from multidrop.gateway.opcua import FAULT, MEMBERS, STATE
+from multidrop.gateway.opcua import FAULT, MEMBERS, PROPERTIES, STATE
 from multidrop.gateway.parts import PartContext
 from multidrop.supervisor import supervisor
 from multidrop.toml_check import ADDRESS, parse_address
@@ -96,9 +96,12 @@ class OpcUaSettings:
         drives = drives_of(plant)
         channels = {polled.drive.name: {one.name for one in polled.channels} for polled in plant.drives}
         for name in drives:
-            owner, _, rest = name.rpartition(".")
-            if owner in drives and rest in {*drives[owner].registers, *channels[owner], *MEMBERS}:
-                yield f'drive "{name}" has the node id of a value of "{owner}": choose another name'
+            parts = name.split(".")
+            for at in range(1, len(parts)):
+                owner, member, rest = ".".join(parts[:at]), parts[at], ".".join(parts[at + 1 :])
+                members = {*drives[owner].registers, *channels[owner], *MEMBERS} if owner in drives else ()
+                if member in members and rest in PROPERTIES:
+                    yield f'drive "{name}" has the node id of a value of "{owner}": choose another name'
             for channel in channels[name] & {*MEMBERS}:
                 yield f'channel "{channel}" of "{name}" has the node id of another value: choose another name'
 
