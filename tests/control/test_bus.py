@@ -125,7 +125,7 @@ def test_all_readings_take_as_few_requests_as_the_family_allows(family: type[Dri
 
 @pytest.mark.slow
 @patient
-def test_drives_of_all_families_are_read_at_their_own_baud_rate_and_format() -> None:
+def test_all_families_are_read_at_their_own_baud_rate_and_format() -> None:
     drives = [
         ErmanERG220(1),
         InvtCHE(2, baudrate=19200, format="8E1"),
@@ -494,7 +494,7 @@ def read_until_closed(bus: Bus, rig: Rig) -> None:
 
 @pytest.mark.slow
 @patient
-def test_reads_on_a_bus_that_another_thread_closes_end_with_an_error() -> None:
+def test_a_read_ends_with_an_error_if_another_thread_closes_the_bus() -> None:
     """Each round has a new line, because the old line may still get late replies."""
     for _ in range(20):
         with unpaced(simulated(Rig(1))) as sim:

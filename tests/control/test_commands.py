@@ -86,7 +86,7 @@ def test_the_stop_of_a_removed_drive_is_not_sent() -> None:
     assert isinstance(found["gone"].error, NotAttached)
 
 
-def test_commands_to_a_drive_without_a_line_are_not_sent() -> None:
+def test_a_command_to_a_drive_without_a_line_is_not_sent() -> None:
     drive = InvtCHE(1, name="mill", maximum_frequency=50)
     for result in (carry_out_verb(drive, "start", {}), write_register(drive, "setpoint", 10.0)):
         assert result.outcome is CommandOutcome.NOT_SENT

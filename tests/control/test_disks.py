@@ -107,7 +107,7 @@ def _is_record(line: bytes) -> bool:
     return True
 
 
-def test_stops_are_sent_despite_a_full_disk(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_stop_is_sent_despite_a_full_disk(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = tmp_path / "audit.jsonl"
     line, drive, sim = one(InvtCHE(1, maximum_frequency=50), audit=path)
     drive.set_frequency(20)

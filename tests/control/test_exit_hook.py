@@ -144,7 +144,7 @@ def test_a_third_signal_ends_the_wait_without_standard_error(
     until(lambda: exit_threads() <= others)
 
 
-def test_repeated_hang_up_signals_do_not_end_the_wait(caught: list[int]) -> None:
+def test_a_repeated_hang_up_signal_does_not_end_the_wait(caught: list[int]) -> None:
     """The kernel and the shell may each send SIGHUP when a terminal closes."""
     before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
     try:

@@ -222,7 +222,7 @@ def test_a_setpoint_is_kept_if_one_reply_was_lost(model: str) -> None:
 
 
 @pytest.mark.slow
-def test_polls_without_a_reply_count_as_silence() -> None:
+def test_a_poll_without_a_reply_counts_as_silence() -> None:
     """Missed polls alone, without calls, make the drive's identity uncertain."""
     sim = simulated(MAKE["invt-che"](1))
     assert isinstance(sim, MotorDrive)

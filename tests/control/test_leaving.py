@@ -48,7 +48,7 @@ def test_a_bus_shows_whether_stop_on_exit_was_called(pair: RunningPair) -> None:
     assert pair.bus.stops_on_exit is True
 
 
-def test_drives_are_stopped_immediately_when_the_bus_is_left(pair: RunningPair) -> None:
+def test_all_drives_are_stopped_immediately_on_leave(pair: RunningPair) -> None:
     pair.bus.stop_on_exit()
     pair.bus.leave()
     until(lambda: pair.turning == [False, False])

@@ -148,7 +148,7 @@ def test_no_call_sends_once_the_process_is_no_longer_master(scene: Scene, call: 
     assert scene.requests == before
 
 
-def test_requests_without_mastership_do_not_count_as_drive_failures(scene: Scene) -> None:
+def test_a_request_without_the_right_to_send_is_no_drive_failure(scene: Scene) -> None:
     for _ in range(3):
         with pytest.raises(NotMaster):
             scene.drive.read(Toy.output_current)
@@ -219,7 +219,7 @@ def test_a_read_after_a_start_raises_if_the_process_is_no_longer_master(scene: S
 
 
 @pytest.mark.slow
-def test_commands_can_be_sent_once_the_process_is_master_again(scene: Scene) -> None:
+def test_a_command_can_be_sent_once_the_process_is_master_again(scene: Scene) -> None:
     scene.become_master()
     scene.drive.start()
     scene.mastership.end()

@@ -90,7 +90,7 @@ def test_a_verb_returns_the_result_of_its_script() -> None:
 
 
 @table("model", MAKE)
-def test_set_frequency_start_and_stop_return_a_command_result(model: str) -> None:
+def test_a_verb_returns_a_command_result(model: str) -> None:
     _, drive, _ = one(MAKE[model](1))
     for result in (drive.set_frequency(20), drive.start(), drive.stop()):
         assert result.ok
@@ -371,7 +371,7 @@ def test_a_setpoint_that_the_drive_refuses_does_not_change_the_known_setpoint() 
 
 @every_unreadable
 @pytest.mark.parametrize("arrives", [True, False])
-def test_after_a_lost_reply_the_setpoint_is_unknown_and_a_start_is_refused(make: Make, arrives: bool) -> None:
+def test_a_start_is_refused_if_a_setpoint_had_no_reply(make: Make, arrives: bool) -> None:
     bus, drive = told(make)
     if arrives:
         bus.loses = is_write
@@ -415,7 +415,7 @@ def test_a_setpoint_already_in_eeprom_becomes_known_without_a_write(monkeypatch:
     assert drive.commanded == 20
 
 
-def test_writing_the_setpoint_register_sets_the_known_setpoint() -> None:
+def test_a_write_of_the_setpoint_register_sets_the_known_setpoint() -> None:
     bus, drive = told(lambda: InnovertIBD(1, maximum_frequency=50))
     drive.write(drive.register("frequency"), 30)
     assert drive.commanded == 30

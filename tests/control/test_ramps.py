@@ -173,7 +173,7 @@ def test_staggered_starts_keep_the_given_gap(gap: float) -> None:
 
 
 @pytest.mark.parametrize("gap", [4.0, 25.0])
-def test_drives_waiting_for_a_staggered_start_are_read_regularly(gap: float) -> None:
+def test_a_drive_that_waits_for_its_start_is_read_regularly(gap: float) -> None:
     """Otherwise a start would be refused: after a silence, a setpoint that cannot be read counts as lost."""
     sims: list[Any] = [simulated(InnovertIBD(address, maximum_frequency=50)) for address in range(1, 6)]
     line = SimulatedBus(*sims)

@@ -161,7 +161,7 @@ def test_ledger_entries_with_an_older_name_of_the_port_are_counted(old: str, spe
             assert [(each.cell.port, each.writes) for each in ledger.wear(1003.0)] == [(now, 3)]
 
 
-def test_writes_to_registers_in_ram_are_not_in_the_ledger(tmp_path: Path) -> None:
+def test_a_write_to_a_register_in_ram_is_not_in_the_ledger(tmp_path: Path) -> None:
     class Fan(Drive):
         """A user's own drive."""
 
@@ -207,7 +207,7 @@ def test_a_user_without_a_home_can_stop_drives_but_not_write_eeprom(monkeypatch:
 
 @with_names
 @pytest.mark.parametrize("port", ["pty", "link", "socket://127.0.0.1:0", "socket://0.0.0.0:0"])
-def test_writes_to_a_simulated_drive_are_not_in_the_user_s_ledger(tmp_path: Path, port: str) -> None:
+def test_a_write_to_a_simulated_drive_is_not_in_the_users_ledger(tmp_path: Path, port: str) -> None:
     with toys(str(tmp_path / "link") if port == "link" else port) as sim:
         path = sim.wires[0].path.replace("0.0.0.0", "127.0.0.1")
         write(path, 12.0)
@@ -468,7 +468,7 @@ def test_an_unconfirmed_write_is_recorded_with_its_author(audited: Audited) -> N
     assert audited.noted() == [("setpoint = 40.00 %", "anna", None)]
 
 
-def test_stops_after_a_failed_staggered_start_are_recorded_with_the_callers_name(audited: Audited) -> None:
+def test_a_stop_after_a_failed_staggered_start_is_recorded_with_its_caller(audited: Audited) -> None:
     """The stops run on new threads, but their records name the author that was set in the caller's thread."""
     drive = audited.drive
     drive.set_frequency(20)
@@ -534,7 +534,7 @@ NAMES: list[tuple[Any, str | None]] = [
 
 @pytest.mark.parametrize(("who", "noted"), NAMES, ids=range(len(NAMES)))
 @pytest.mark.parametrize("is_way", [False, True])
-def test_with_an_invalid_author_only_a_stop_is_sent(
+def test_an_invalid_author_prevents_writes_but_no_stop(
     audited: Audited, who: Any, noted: str | None, is_way: bool
 ) -> None:
     bus, drive = audited.bus, audited.drive

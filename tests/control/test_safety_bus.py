@@ -100,7 +100,7 @@ def test_a_write_that_is_forbidden_is_not_sent(drive: Drive, name: str, value: f
     assert line.written == []
 
 
-def test_writes_allowed_only_at_rest_are_refused_while_the_motor_turns() -> None:
+def test_a_write_allowed_only_at_rest_is_refused_while_the_motor_turns() -> None:
     line, drive, sim = one(YD1000(1))
     drive.set_frequency(20)
     drive.start()
@@ -311,7 +311,7 @@ def test_a_trip_during_a_start_raises_not_verified(monkeypatch: pytest.MonkeyPat
     assert drive.state().condition is Condition.STOPPED
 
 
-def test_after_a_power_cycle_a_start_is_refused_until_a_setpoint_is_written() -> None:
+def test_a_start_after_a_power_cycle_needs_a_new_setpoint() -> None:
     """The drive loses its setpoint in the power cycle. Its motor stays off, and the next start is refused."""
     line, drive, sim = one(YD1000(1))
     drive.set_frequency(40)
@@ -375,7 +375,7 @@ def test_a_setpoint_loop_to_eeprom_is_refused_with_advice() -> None:
     assert sim.counters.eeprom_writes["frequency"] == 2
 
 
-def test_writes_beyond_the_yearly_budget_are_refused(tmp_path: Path) -> None:
+def test_a_write_beyond_the_yearly_budget_is_refused(tmp_path: Path) -> None:
     line, drive, sim = one(ErmanERG220(1), ledger=Ledger(tmp_path / "wear", budget=5))
     # The manual does not say whether the frequency is kept in EEPROM. So its writes count in the yearly
     # budget, but may follow each other within a minute.
@@ -487,7 +487,7 @@ def test_an_identity_check_that_writes_is_refused() -> None:
     assert line.frames == []
 
 
-def test_writes_allowed_only_at_rest_are_refused_if_the_state_is_unreadable() -> None:
+def test_a_write_allowed_only_at_rest_is_refused_without_a_readable_state() -> None:
     class Mute(Drive):
         """A family without the verb `state`."""
 

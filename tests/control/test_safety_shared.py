@@ -241,7 +241,7 @@ class Stranger:
 @pytest.mark.slow
 @pytest.mark.long
 @pytest.mark.parametrize("model", RTU_FAMILIES)
-def test_starts_and_stops_are_correct_while_another_client_sends(model: str) -> None:
+def test_the_starts_and_stops_are_correct_while_another_client_sends(model: str) -> None:
     with shared_line(model, seed=1) as (drive, pair, (first, second)), ExitStack() as stack:
         set_frequency(drive, 20)
         stranger = stack.enter_context(Stranger(pair.theirs, model, seed=2))
@@ -313,7 +313,7 @@ MOMENTS = [("start", says) for says in SAYS] + [
 @pytest.mark.slow
 @patient
 @pytest.mark.parametrize(("verb", "says"), usually(*MOMENTS))
-def test_frames_of_another_client_do_not_confirm_a_start_or_a_reset(verb: str, says: str) -> None:
+def test_another_clients_frame_does_not_confirm_a_start_or_reset(verb: str, says: str) -> None:
     with shared_line("invt-che", seed=3) as (drive, pair, received):
         set_frequency(drive, 20)
         if verb == "reset_fault":
@@ -330,7 +330,7 @@ def test_frames_of_another_client_do_not_confirm_a_start_or_a_reset(verb: str, s
 @pytest.mark.slow
 @patient
 @pytest.mark.parametrize("says", usually(*SAYS))
-def test_frames_of_another_client_do_not_confirm_a_stop(says: str) -> None:
+def test_another_clients_frame_does_not_confirm_a_stop(says: str) -> None:
     with shared_line("invt-che", seed=3) as (drive, pair, received):
         running(drive, received[0])
         pair.says = SAYS[says]

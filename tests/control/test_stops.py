@@ -85,7 +85,9 @@ def test_a_stop_called_at_any_frame_of_a_start_wins(tmp_path: Path, model: str, 
 
 @pytest.mark.parametrize("verb_name", ["coast", "emergency_stop"])
 @every_family
-def test_coast_and_emergency_stop_also_cancel_a_start(tmp_path: Path, model: str, verb_name: str) -> None:
+def test_a_coast_or_an_emergency_stop_also_cancels_a_start(
+    tmp_path: Path, model: str, verb_name: str
+) -> None:
     if getattr(type(MAKE[model](1)), verb_name) is getattr(Drive, verb_name):
         return
 
@@ -428,7 +430,7 @@ def test_a_stop_on_a_closed_port_raises_immediately() -> None:
     assert line.seconds - begun < 0.1
 
 
-def test_stops_of_a_line_do_not_each_wait_for_a_port_that_is_slow_to_open(
+def test_the_stops_of_a_line_share_the_wait_for_a_slow_port(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A server that is switched off may delay each attempt to connect for five seconds."""

@@ -152,7 +152,7 @@ def test_a_stop_within_the_deadline_function_cancels_the_write(line: SimulatedBu
 
 
 @table("limit", [0.5, True, "1", None])
-def test_with_an_invalid_time_limit_only_a_stop_is_sent(limit: Any) -> None:
+def test_an_invalid_time_limit_prevents_writes_but_no_stop(limit: Any) -> None:
     line, drive, _ = one(InvtCHE(1, maximum_frequency=50))
     with written_before(limit):
         for call in (lambda: drive.set_frequency(20), drive.start):

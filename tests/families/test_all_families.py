@@ -96,7 +96,7 @@ def test_every_family_names_its_rs485_terminals(family: type[Drive]) -> None:
     assert family.line_terminals == TERMINALS[family.model]
 
 
-def test_error_for_an_unknown_framing_names_a_valid_one() -> None:
+def test_the_error_for_an_unknown_framing_names_a_valid_one() -> None:
     with pytest.raises(
         ValueError, match=r"^framing 'ascii' is not supported by .*, which has delixi; write delixi, or leave"
     ):
@@ -124,7 +124,7 @@ def test_base_class_drive_cannot_be_used_as_a_family() -> None:
 @family
 @table("name", ["start", "jog"])
 @table("given", ["reverse", "forward", True, 25.0, CHEStatus.REVERSE])
-def test_start_in_an_invalid_direction_raises(family: type[Drive], name: str, given: object) -> None:
+def test_a_start_in_an_invalid_direction_raises(family: type[Drive], name: str, given: object) -> None:
     """A wrong direction must not turn the motor, so no frame is sent."""
     drive = family(family.addresses[0], name="pump")
     drive.perform = pytest.fail
@@ -178,7 +178,7 @@ def test_every_framing_of_a_family_has_character_formats(family: type[Drive]) ->
 
 
 @family
-def test_read_limits_are_declared_only_for_tables_of_the_family(family: type[Drive]) -> None:
+def test_the_read_limits_of_a_family_are_for_its_own_tables(family: type[Drive]) -> None:
     tables = {register.table for register in family.registers.values()}
     assert {*family.most_registers, *family.readable_gaps} <= tables
 
@@ -208,7 +208,7 @@ def test_a_factory_value_survives_encoding_and_decoding(family: type[Drive], reg
 
 
 @table("family, register", registers(lambda each: each.values))
-def test_named_values_survive_encoding_and_decoding(family: type[Drive], register: Register[Any]) -> None:
+def test_the_named_values_survive_encoding_and_decoding(family: type[Drive], register: Register[Any]) -> None:
     assert register.values
     for member in register.values:
         assert register.decode(register.encode(member)) is member
@@ -409,7 +409,7 @@ def test_verbs_not_in_the_document_are_unsupported_and_send_nothing(family: type
     assert wire.sent == []
 
 
-def test_state_as_text_shows_condition_direction_fault_and_note() -> None:
+def test_a_state_as_text_shows_condition_direction_fault_and_note() -> None:
     said = State(Condition.FAULT, Direction.REVERSE, "OVERCURRENT", "watchdog is off")
     assert str(said) == "fault reverse (OVERCURRENT) - watchdog is off"
     assert str(State(Condition.UNKNOWN)) == "unknown"

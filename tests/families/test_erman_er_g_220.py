@@ -240,7 +240,7 @@ def test_erman_start_is_refused_if_the_setpoint_is_0_or_was_changed() -> None:
     assert wire.sent == sent
 
 
-def test_error_names_the_keypad_setting_if_an_erman_does_not_start() -> None:
+def test_the_error_names_the_keypad_setting_if_an_erman_does_not_start() -> None:
     wire = Wire(ErmanERG220(1), STOPPED)
     with pytest.raises(Unconfirmed, match=r"to run; stop it, or it may start later; b\.001 must be 2"):
         wire.drive.start()

@@ -416,7 +416,7 @@ def test_each_of_the_25_families_has_a_responder() -> None:
 
 
 @table("name", COMMANDED)
-def test_commands_to_each_family_send_the_words_of_its_manual(name: str) -> None:
+def test_the_commands_of_each_family_are_those_of_its_manual(name: str) -> None:
     sheet = SHEETS[name]
     driven, there = connected(name)
     assert driven.state().condition is sheet.standing
@@ -441,7 +441,7 @@ def test_commands_to_each_family_send_the_words_of_its_manual(name: str) -> None
 
 
 @table("name", READ_ONLY)
-def test_read_only_families_return_the_values_of_their_manuals(name: str) -> None:
+def test_the_read_only_families_return_the_values_of_their_manuals(name: str) -> None:
     drive, there = connected(name)
     drive.bus.check_identity(drive)
     assert values(drive, SHEETS[name].shown) == SHEETS[name].shown

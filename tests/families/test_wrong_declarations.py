@@ -174,7 +174,7 @@ def test_delta_drive_declared_as_a_goodrive_is_stopped_but_gets_no_coast() -> No
     assert pair.bus.written != []
 
 
-def test_error_for_a_chf100a_declared_as_an_invt_che_names_the_right_model() -> None:
+def test_the_error_for_a_wrongly_declared_chf100a_names_its_model() -> None:
     pair = Pair("invt-che", "invt-chf100a", turns=True)
     with pytest.raises(WriteForbidden, match="declare model invt-chf100a"):
         pair.drive.start()
@@ -191,7 +191,7 @@ def test_erman_declared_as_an_optidrive_has_an_unknown_state() -> None:
 
 
 @table("declared", COMMANDED)
-def test_stop_is_sent_although_a_gateway_answers_ffff_for_the_drive(declared: str) -> None:
+def test_a_stop_is_sent_although_a_gateway_answers_ffff(declared: str) -> None:
     bus = SimulatedBus()
     drive = bus.attach(DECLARED[declared](1))
     bus.answers = lambda request: (
@@ -217,7 +217,7 @@ def ask(sim: Any, drive: Drive, request: Message) -> Message:
 
 
 @table("there", [*RECOGNISABLE, "invt-che", "yd1000", "delixi-modbus"])
-def test_scan_finds_drives_that_identify_themselves(there: str) -> None:
+def test_a_scan_finds_drives_that_identify_themselves(there: str) -> None:
     drive = THERE[there](1)
     sweep = Sweep(drive.settings, drive.framing, (), ScanRequest(3, 0, 1), (1,), 0.0, 0.0)
     found, doubt = identify(sweep, 1, SCANNED, partial(ask, simulated(drive)))

@@ -492,7 +492,7 @@ def test_yd1000_terminals_without_a_run_function_do_not_block_a_reset(closed: In
     assert wire.sent == [frame(YD1000(1), YD1000.control, YD1000Control(0xE000)), STOP]
 
 
-def test_error_of_an_inferred_yd1000_limit_names_its_source() -> None:
+def test_the_error_of_an_inferred_yd1000_limit_names_its_source() -> None:
     """The document limits the upper frequency limit by the maximum frequency; the reverse is inferred."""
     wire = Wire(YD1000(1), {**STANDING, "upper_limit_frequency": 60.0})
     with pytest.raises(

@@ -72,7 +72,7 @@ def attached(drive: Drive, extra: list[str]) -> tuple[SimulatedBus, Drive, Motor
 
 
 @pytest.mark.parametrize("family", usually(GOODRIVE, *[one for one in EXTRA if one is not GOODRIVE]))
-def test_saved_parameters_are_restored_after_a_factory_reset(tmp_path: Path, family: type[Drive]) -> None:
+def test_the_saved_parameters_are_restored_after_a_factory_reset(tmp_path: Path, family: type[Drive]) -> None:
     line, drive, sim = attached(made(family), EXTRA[family])
     there = writable(drive, EXTRA[family])
     assert there
@@ -106,7 +106,7 @@ def test_running_motor_makes_apply_raise_and_write_nothing(family: type[Drive]) 
     assert line.written == []
 
 
-def test_run_command_at_zero_speed_makes_apply_raise() -> None:
+def test_a_run_command_at_zero_speed_makes_apply_raise() -> None:
     line, drive, sim = attached(YD1000(1), [])
     sim.motor.target = 0.0
     sim.motor.run()

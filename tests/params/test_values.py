@@ -74,7 +74,7 @@ def test_the_longest_block_that_the_drive_accepts_is_learnt() -> None:
     assert counts(line) == [16, 8, 8, 8, 8]
 
 
-def test_read_with_codes_reads_only_these_parameters() -> None:
+def test_a_read_with_codes_reads_only_these_parameters() -> None:
     line, drive = blocky(set())
     assert dict(params.read(drive, ["P01.02"]).values) == {"P01.02": 18}
     assert counts(line) == [1]
@@ -111,7 +111,7 @@ ADDRESSES = [
 
 
 @table("model, code, address", ADDRESSES)
-def test_addresses_of_parameters_are_those_of_the_sources(model: str, code: str, address: int) -> None:
+def test_the_parameter_addresses_are_those_of_the_sources(model: str, code: str, address: int) -> None:
     assert parameters_of(find_model(model))[code].address == address
 
 
@@ -171,7 +171,7 @@ def test_factory_values_are_those_of_the_manual() -> None:
         params.defaults(DelixiModbus)
 
 
-def test_monitor_values_are_not_listed_as_parameters() -> None:
+def test_the_monitor_values_are_not_listed_as_parameters() -> None:
     assert not any(code.startswith("P05.") for code in parameters_of(DelixiModbus))
 
 
@@ -193,7 +193,7 @@ FOUND = params.ParameterSet(
 
 
 @pytest.mark.parametrize("name", ["pump.toml", "pump.csv"])
-def test_saved_parameter_files_load_with_the_same_values(tmp_path: Path, name: str) -> None:
+def test_a_saved_parameter_file_loads_with_the_same_values(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
     params.save(FOUND, path, YD1000)
     found = params.load(path)

@@ -405,7 +405,7 @@ class StopRun:
         latest = interruption
         try:
             self._begin()
-            # stops of which a frame may already have been sent come last
+            # stops whose frames were certainly not sent come first
             for attempt in sorted(self._left(), key=StopAttempt.is_in_doubt):
                 attempt.once_more(self._stopper.do)
         except BaseException as another:

@@ -111,7 +111,7 @@ def test_family_file_gives_the_same_values_as_the_equivalent_class(plant: Path) 
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.usefixtures("_unpainted")
-def test_plant_with_two_family_files_works(run: Run, plant: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_plant_with_two_family_files_works(run: Run, plant: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(plant.parent)
     lines = Plant.load(plant).lines
     drives = [simulated(polled.drive) for polled in lines[0].drives]

@@ -70,7 +70,7 @@ def test_class_from_a_family_file_equals_the_hand_written_class(tmp_path: Path) 
     assert (loaded.__name__, loaded.model, loaded.declared_in) == ("Meter", "meter.toml", "meter.toml")
 
 
-def test_values_in_a_family_file_are_read_by_their_names(tmp_path: Path) -> None:
+def test_the_values_in_a_family_file_are_read_by_name(tmp_path: Path) -> None:
     loaded = load_family(write_meter(tmp_path))
     assert loaded.register("mode").format(loaded.register("mode").decode(1)) == "automatic"
     alarms = loaded.register("alarms").decode(9)
@@ -142,7 +142,7 @@ def test_family_file_can_declare_a_device_without_a_motor(tmp_path: Path) -> Non
     assert not family(tmp_path, f"{HEAD}motor = false\n{reading}").has_motor
 
 
-def test_addresses_of_a_family_file_may_be_unit_ids_0_to_255(tmp_path: Path) -> None:
+def test_a_family_file_may_allow_drive_addresses_0_to_255(tmp_path: Path) -> None:
     head = HEAD + "addresses = [0, 255]\n[reading]\nlevel = { at = 1 }\n"
     loaded = family(tmp_path, head)
     assert loaded.addresses == range(256)

@@ -115,7 +115,7 @@ def test_invalid_csv_cell_is_refused_with_a_valid_example(cell: str, sentence: s
     assert sentence in str(refused.value)
 
 
-def test_addresses_count_from_0_if_the_family_file_states_no_start() -> None:
+def test_the_addresses_of_a_family_file_count_from_0_by_default() -> None:
     counting = Counting(None)
     assert counting.address(16, None, "holding") == (16, "holding")
     assert counting.address("40001", None, "holding") == (0, "holding")

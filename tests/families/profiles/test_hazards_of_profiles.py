@@ -60,7 +60,7 @@ class Line:
         assert self.drive.state().condition is Condition.RUNNING
 
 
-def test_start_runs_the_motor_and_stop_ends_the_run(line: Line) -> None:
+def test_a_start_runs_the_motor_until_a_stop(line: Line) -> None:
     line.runs()
     assert len(line.starts) == 1
     assert abs(line.sim.motor.target) == pytest.approx(20, abs=0.01)
@@ -72,7 +72,7 @@ def test_start_runs_the_motor_and_stop_ends_the_run(line: Line) -> None:
     assert line.sim.motor.energised
 
 
-def test_stop_waits_until_the_motor_is_at_rest(line: Line) -> None:
+def test_a_stop_waits_until_the_motor_is_at_rest(line: Line) -> None:
     line.runs()
     line.set_ramps(20.0)
     before = line.bus.seconds
@@ -81,7 +81,7 @@ def test_stop_waits_until_the_motor_is_at_rest(line: Line) -> None:
     assert line.sim.motor.frequency == 0
 
 
-def test_trip_during_a_start_is_reported(line: Line, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_trip_during_a_start_is_reported(line: Line, monkeypatch: pytest.MonkeyPatch) -> None:
     line.drive.set_frequency(20)
     monkeypatch.setattr(line.sim.motor, "run", lambda direction: line.sim.trip(FAULT))
     with pytest.raises(NotVerified, match="tripped"):
@@ -93,7 +93,7 @@ def test_trip_during_a_start_is_reported(line: Line, monkeypatch: pytest.MonkeyP
     assert len(line.starts) == 1
 
 
-def test_reset_never_starts_the_motor(line: Line) -> None:
+def test_a_reset_never_starts_the_motor(line: Line) -> None:
     """The run command may still be set at the trip, and the drive may obey its level."""
     line.runs()
     line.sim.trip(FAULT)
@@ -113,7 +113,7 @@ def test_reset_never_starts_the_motor(line: Line) -> None:
 
 
 @pytest.mark.parametrize("lost", range(4))
-def test_reset_with_lost_replies_never_starts_the_motor(line: Line, lost: int) -> None:
+def test_a_reset_with_lost_replies_never_starts_the_motor(line: Line, lost: int) -> None:
     line.runs()
     line.sim.trip(FAULT)
     begun = len(line.writes)
@@ -132,7 +132,7 @@ def test_reset_with_lost_replies_never_starts_the_motor(line: Line, lost: int) -
     assert line.sim.motor.fault == FAULT  # the new fault stays, because the reset bit was cleared
 
 
-def test_reset_without_a_fault_sends_no_write(line: Line) -> None:
+def test_a_reset_without_a_fault_sends_no_write(line: Line) -> None:
     line.drive.reset_fault()
     assert line.writes == []
 
@@ -145,7 +145,7 @@ def test_fault_that_remains_after_a_reset_is_reported(line: Line, monkeypatch: p
     assert not line.starts
 
 
-def test_start_without_a_setpoint_is_refused(line: Line) -> None:
+def test_a_start_without_a_setpoint_is_refused(line: Line) -> None:
     with pytest.raises(WriteForbidden, match="set_frequency"):
         line.drive.start()
     assert line.writes == []
@@ -155,7 +155,7 @@ def test_start_without_a_setpoint_is_refused(line: Line) -> None:
     assert not line.starts
 
 
-def test_start_after_a_power_cycle_requires_a_new_setpoint(line: Line, model: str) -> None:
+def test_a_start_after_a_power_cycle_requires_a_new_setpoint(line: Line, model: str) -> None:
     """The motor stays off. The next start is refused, unless the drive's setpoint cannot be read."""
     line.runs()
     line.sim.power_cycle()
@@ -184,7 +184,7 @@ LOCAL = {
 
 
 @table("model", LOCAL)
-def test_start_is_refused_while_the_keypad_is_in_control(model: str) -> None:
+def test_a_start_is_refused_while_the_keypad_is_in_control(model: str) -> None:
     line = Line(model)
     line.drive.set_frequency(20)
     line.sim.is_local = True
@@ -219,7 +219,7 @@ def test_direction_of_a_start_is_sent_or_refused(line: Line, model: str) -> None
     assert line.drive.state().condition is Condition.RUNNING
 
 
-def test_plain_write_of_a_start_word_is_refused(line: Line) -> None:
+def test_a_plain_write_of_a_start_word_is_refused(line: Line) -> None:
     control = line.drive.control
     requests = {count: Message(1, 6, control.address, data=count.to_bytes(2)) for count in range(0x900)}
     starts = [count for count, request in requests.items() if line.is_start(request)]
@@ -248,7 +248,7 @@ def test_setpoint_outside_the_frequency_limits_is_refused(line: Line) -> None:
     assert line.writes == []
 
 
-def test_ramp_continues_from_the_setpoint_in_force(line: Line) -> None:
+def test_a_ramp_continues_from_the_setpoint_in_force(line: Line) -> None:
     """The ramp is computed in Hz, even if the setpoint register holds a percentage that cannot be read."""
     line.drive.set_frequency(20)
     begun = len(line.writes)
@@ -257,7 +257,7 @@ def test_ramp_continues_from_the_setpoint_in_force(line: Line) -> None:
     assert line.sim.motor.target == pytest.approx(22, abs=0.01)
 
 
-def test_jog_that_continues_after_a_stop_is_ended_by_stop_jog() -> None:
+def test_a_jog_that_continues_after_a_stop_is_ended_by_stop_jog() -> None:
     line = Line("invt-goodrive")
     line.sim.jog_needs_own_stop = True
     line.drive.option["stop_time"] = 3.0
@@ -271,7 +271,7 @@ def test_jog_that_continues_after_a_stop_is_ended_by_stop_jog() -> None:
 
 
 @pytest.mark.parametrize("is_refused", [False, True], ids=["not heard", "refused"])
-def test_stop_jog_is_sent_after_an_unconfirmed_stop(is_refused: bool) -> None:
+def test_the_command_stop_jog_is_sent_after_an_unconfirmed_stop(is_refused: bool) -> None:
     """The replies to the stop are lost, as with a broken wire, or the drive refuses a stop during a jog."""
     line = Line("invt-goodrive")
     line.sim.jog_needs_own_stop = True
@@ -293,7 +293,7 @@ def test_stop_jog_is_sent_after_an_unconfirmed_stop(is_refused: bool) -> None:
     assert not line.sim.motor.energised
 
 
-def test_stop_jog_is_not_sent_to_a_drive_of_another_make(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_stop_jog_is_not_sent_to_other_makes(monkeypatch: pytest.MonkeyPatch) -> None:
     line = Line("invt-goodrive")
     checked: list[Drive] = []
 
@@ -308,7 +308,7 @@ def test_stop_jog_is_not_sent_to_a_drive_of_another_make(monkeypatch: pytest.Mon
     assert line.writes == []
 
 
-def test_start_of_a_cia402_drive_without_mains_voltage_is_refused() -> None:
+def test_a_start_of_a_cia402_drive_without_mains_is_refused() -> None:
     line = Line("schneider-atv320")
     line.drive.set_frequency(20)
     line.sim.stays_off = True
@@ -318,7 +318,7 @@ def test_start_of_a_cia402_drive_without_mains_voltage_is_refused() -> None:
 
 
 @pytest.mark.parametrize("name", ["off2", "off3"])
-def test_start_of_a_profidrive_during_off2_or_off3_is_refused(name: str) -> None:
+def test_a_profidrive_start_during_off2_or_off3_is_refused(name: str) -> None:
     line = Line("abb-acs355")
     line.drive.set_frequency(20)
     setattr(line.sim, name, True)
@@ -338,7 +338,7 @@ def test_a_coast_command_during_a_run_is_not_overridden() -> None:
     assert line.drive.state().condition is Condition.STOPPED
 
 
-def test_reset_of_a_trip_that_only_a_power_cycle_clears_is_refused() -> None:
+def test_a_reset_of_a_locked_trip_is_refused_until_a_power_cycle() -> None:
     line = Line("danfoss-fc51")
     line.sim.trip(FAULT)
     line.sim.is_locked = True
@@ -374,7 +374,7 @@ OF_ANOTHER = {
 
 @table("first", OF_ANOTHER)
 @table("second", OF_ANOTHER)
-def test_stop_is_withheld_only_if_two_values_show_another_make(first: str, second: str) -> None:
+def test_a_stop_is_refused_only_if_two_values_show_another_make(first: str, second: str) -> None:
     """One make's stop word may run another make's motor. One value, or two settings, prove nothing."""
     line = Line("abb-acs355")
     shown = {line.drive.register(name).address: OF_ANOTHER[name] for name in (first, second)}
@@ -395,7 +395,7 @@ def test_stop_is_withheld_only_if_two_values_show_another_make(first: str, secon
         assert line.writes == []
 
 
-def test_stop_of_a_drive_that_was_once_identified_is_always_sent() -> None:
+def test_a_stop_of_an_identified_drive_is_always_sent() -> None:
     line = Line("invt-goodrive")
     line.runs()
     line.sim["device"] = 0

@@ -263,7 +263,7 @@ def test_abb_start_waits_100_ms_between_its_control_words() -> None:
 
 
 @pytest.mark.parametrize("model", ["abb-acs355", "siemens-v20"])
-def test_start_of_a_running_profidrive_drive_sends_no_off_word(model: str) -> None:
+def test_a_start_of_a_running_profidrive_drive_sends_no_off_word(model: str) -> None:
     found = wire(model, ABB_RUNS)
     found.drive.start()
     assert [frame[-5:] for frame in sent(found)] == ["04 7F"]
@@ -282,7 +282,7 @@ COASTS = {
 
 
 @table("model", COASTS)
-def test_coast_sends_the_control_word_printed_in_the_manual(model: str) -> None:
+def test_a_coast_sends_the_control_word_printed_in_the_manual(model: str) -> None:
     status, coast = COASTS[model]
     found = wire(model, status, output_frequency=[12.0, 0.0])
     found.drive.coast()
@@ -291,7 +291,7 @@ def test_coast_sends_the_control_word_printed_in_the_manual(model: str) -> None:
 
 
 @table(("model", "status"), [("delta-vfd-el", DELTA_STOP), ("yaskawa-a1000", YK_OFF)])
-def test_coast_of_a_family_without_a_coast_word_is_unsupported(model: str, status: int) -> None:
+def test_a_coast_without_a_coast_word_is_unsupported(model: str, status: int) -> None:
     with pytest.raises(Unsupported, match="no coast"):
         wire(model, status).drive.coast()
 
@@ -308,14 +308,14 @@ REVERSES = {
 
 
 @table("model", REVERSES)
-def test_reverse_start_sends_the_control_word_printed_in_the_manual(model: str) -> None:
+def test_a_reverse_start_sends_the_control_word_of_the_manual(model: str) -> None:
     status, word = REVERSES[model]
     found = wire(model, status)
     found.drive.start(Direction.REVERSE)
     assert sent(found)[-1] == word
 
 
-def test_jog_sends_the_control_word_of_its_direction() -> None:
+def test_a_jog_sends_the_control_word_of_its_direction() -> None:
     found = wire("delta-vfd-el", [DELTA_STOP, DELTA_RUNS])
     found.drive.jog()
     assert sent(found) == [DELTA + "00 13"]
@@ -341,7 +341,7 @@ def test_jog_sends_the_control_word_of_its_direction() -> None:
         ("yaskawa-a1000", 0),
     ],
 )
-def test_start_is_refused_while_the_status_is_impossible(model: str, status: int) -> None:
+def test_a_start_is_refused_while_the_status_is_impossible(model: str, status: int) -> None:
     found = wire(model, [status])
     with pytest.raises(WriteForbidden, match=f"cannot be started: its status is {status:04X}H, and"):
         found.drive.start()
@@ -349,7 +349,7 @@ def test_start_is_refused_while_the_status_is_impossible(model: str, status: int
 
 
 @pytest.mark.parametrize("model", ["delta-vfd-el", "invt-goodrive"])
-def test_jog_is_refused_while_the_status_is_impossible(model: str) -> None:
+def test_a_jog_is_refused_while_the_status_is_impossible(model: str) -> None:
     found = wire(model, [0xA000])
     with pytest.raises(WriteForbidden, match="cannot be started: its status is A000H, and"):
         found.drive.jog()
@@ -360,7 +360,7 @@ def test_jog_is_refused_while_the_status_is_impossible(model: str) -> None:
     ("model", "status"),
     [("delta-vfd-el", DELTA_RUNS), ("delta-vfd-el", DELTA_REVERSE), ("invt-goodrive", GD_RUNS)],
 )
-def test_jog_of_a_turning_motor_is_refused(model: str, status: Any) -> None:
+def test_a_jog_of_a_turning_motor_is_refused(model: str, status: Any) -> None:
     found = wire(model, [status])
     for direction in (None, *Direction):
         with pytest.raises(
@@ -386,7 +386,7 @@ HINDRANCES = [
 
 
 @table(("model", "status", "sentence"), HINDRANCES)
-def test_error_of_a_refused_start_names_the_reason(model: str, status: int, sentence: str) -> None:
+def test_the_error_of_a_refused_start_names_the_reason(model: str, status: int, sentence: str) -> None:
     found = wire(model, status)
     with pytest.raises(WriteForbidden, match=sentence):
         found.drive.start()
@@ -427,7 +427,7 @@ STATES = [
 
 
 @table(("model", "status", "says", "condition"), STATES)
-def test_status_word_of_a_profile_is_decoded_to_the_condition(
+def test_the_condition_is_decoded_from_the_status_word(
     model: str, status: int, says: dict[str, Any], condition: Condition
 ) -> None:
     assert wire(model, status, **says).drive.state().condition is condition
@@ -453,14 +453,14 @@ def test_motor_that_runs_at_0_hz_is_not_reported_as_stopped(model: str, running:
     ("shown", "sentence"),
     [(0.0, "setpoint .* is 0"), (12.5, r"follows 12\.50 Hz, not the setpoint that was written")],
 )
-def test_start_of_a_delta_drive_is_refused_if_it_shows_another_setpoint(shown: float, sentence: str) -> None:
+def test_a_delta_start_is_refused_if_another_setpoint_is_shown(shown: float, sentence: str) -> None:
     found = wire("delta-vfd-el", DELTA_STOP, reference_in_force=shown)
     with pytest.raises(WriteForbidden, match=sentence):
         found.drive.start()
     assert found.sent == []
 
 
-def test_stop_jog_is_sent_at_once_if_an_invt_drive_still_jogs_after_a_stop() -> None:
+def test_the_command_stop_jog_is_sent_if_an_invt_drive_still_jogs() -> None:
     """STOP_JOG is not delayed until the stop's time limit."""
     found = wire("invt-goodrive", GD_RUNS)
     found.drive.option["stop_time"] = 5.0
@@ -470,7 +470,7 @@ def test_stop_jog_is_sent_at_once_if_an_invt_drive_still_jogs_after_a_stop() -> 
     assert found.seconds < 5.5
 
 
-def test_start_of_an_invt_drive_after_a_jog_requires_a_stop() -> None:
+def test_a_start_of_an_invt_drive_after_a_jog_requires_a_stop() -> None:
     found = wire("invt-goodrive", [GD_STANDBY, GD_RUNS])
     found.drive.jog()
     found.sent.clear()

@@ -402,7 +402,7 @@ def test_registers_that_only_identify_a_drive_are_not_polled(name: str) -> None:
     assert not polled & {"station", "signature"}
 
 
-def test_plant_file_can_use_families_of_the_package_by_name(tmp_path: Path) -> None:
+def test_a_plant_file_can_use_families_of_the_package_by_name(tmp_path: Path) -> None:
     plant = tmp_path / "plant.toml"
     names = [name for name in SHIPPED if 9600 in shipped_family(name).baudrates]
     assert len(names) > len(SHIPPED) - 3
