@@ -102,7 +102,7 @@ def test_a_stop_has_failed_if_neither_it_nor_a_broadcast_was_sent(models: tuple[
 
 
 @pytest.mark.parametrize("seconds", [0, 0.05])
-def test_a_stop_with_a_short_time_limit_is_sent_to_each_drive_after_the_broadcast(seconds: float) -> None:
+def test_a_lost_broadcast_stop_is_followed_by_single_stops(seconds: float) -> None:
     """Noise may damage the broadcast, which no drive answers."""
     line, _, sims = che_drives(5, runs_s=20)
     line.deafens = lambda request: request.address == 0

@@ -142,7 +142,7 @@ def test_all_families_are_read_at_their_own_baud_rate_and_format() -> None:
             assert ours.read(register) == proof(ours, register)
 
 
-def test_baud_rate_and_format_of_a_bus_are_used_by_drives_without_their_own() -> None:
+def test_a_drive_without_line_settings_uses_those_of_its_bus() -> None:
     with unpaced(simulated(Toy(1))) as sim, Bus(path(sim), baudrate=19200, format="8N2") as bus:
         assert str(bus.attach(Toy, 1).settings) == "19200 8N2"
         assert str(bus.attach(Toy, 2, baudrate=9600).settings) == "9600 8N2"

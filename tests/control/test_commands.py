@@ -389,7 +389,7 @@ class TimedStops:
         return told
 
 
-def test_a_stop_that_takes_over_from_an_unsuccessful_stop_returns_its_own_result() -> None:
+def test_a_stop_after_an_unsuccessful_stop_returns_its_own_result() -> None:
     timed = TimedStops(NotedStops(), 0)
     assert run_controlled(timed.called_beside(10.0)) == STANDS
     assert timed.calls == [0.0, None]

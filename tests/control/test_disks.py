@@ -41,7 +41,7 @@ def writes(ledger: Ledger) -> int:
 
 
 @pytest.mark.parametrize("room", range(0, 90, 10))
-def test_a_record_that_does_not_fit_on_the_disk_damages_no_other_record(tmp_path: Path, room: int) -> None:
+def test_a_record_on_a_full_disk_damages_no_other_record(tmp_path: Path, room: int) -> None:
     path = tmp_path / "audit.jsonl"
     log, other = AuditLog(path), AuditLog(path)  # `other` is the log of another process
     log.add(0, {"write": "first"})

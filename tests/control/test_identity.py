@@ -195,7 +195,7 @@ LOSSES = [_asleep, _idle, _idle_and_asleep, _read_since, _on_another_port, _on_a
 @pytest.mark.usefixtures("_turns_awaited")
 @pytest.mark.parametrize("model", ["innovert-ibd", "delixi-native"])
 @pytest.mark.parametrize("lose", [*LOSSES, pytest.param(_silent_then_idle, marks=pytest.mark.slow)])
-def test_a_setpoint_that_cannot_be_read_is_forgotten_once_the_drive_may_have_lost_its_power(
+def test_an_unreadable_setpoint_is_forgotten_after_a_possible_power_loss(
     model: str, lose: Callable[..., None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with known(model) as (bus, drive, received):
@@ -618,7 +618,7 @@ def test_other_makes_are_still_recognised_after_a_missing_reply() -> None:
     assert line.written == []
 
 
-def test_no_write_is_sent_on_a_port_that_was_reopened_while_the_write_waited_for_late_replies(
+def test_a_waiting_write_is_not_sent_on_a_reopened_port(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The drive may have been replaced, so its family must be checked again first."""

@@ -108,7 +108,7 @@ def test_a_start_ends_after_a_stop_even_if_its_script_continues() -> None:
     assert line.written == []
 
 
-def test_a_ramp_cancelled_by_a_stop_names_the_write_that_was_not_sent() -> None:
+def test_the_error_of_a_cancelled_ramp_names_the_unsent_write() -> None:
     line, drive, _ = one(YD1000(1))
     drive.set_frequency(10)
     before = len(line.written)

@@ -54,7 +54,7 @@ def test_a_ramp_waits_between_its_steps_but_not_after_the_last() -> None:
     assert line.seconds - written_at[-1] < 0.5
 
 
-def test_the_small_delays_of_a_long_ramp_do_not_add_up_to_an_expiry(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_ramp_does_not_expire_by_its_small_delays(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(YD1000(1))
     drive.set_frequency(1)
     monkeypatch.setattr(clock, "sleep", lambda seconds: line.sleep(seconds + 0.01))
@@ -134,7 +134,7 @@ def test_a_ramp_starts_from_the_setpoint_that_it_reads() -> None:
 
 
 @pytest.mark.parametrize(("most", "seconds"), [(50, 0), (0, 10)])
-def test_a_ramp_needs_a_rate_if_the_drive_s_own_rate_is_zero_or_infinite(most: int, seconds: int) -> None:
+def test_a_ramp_needs_a_rate_if_the_drives_own_is_unusable(most: int, seconds: int) -> None:
     line, drive, sim = ramped(Ramped)
     sim["maximum_frequency"], sim["acceleration_time"] = most, seconds
     with pytest.raises(

@@ -379,7 +379,7 @@ WRITES: dict[str, tuple[str, Callable[[SimulatedBus, Any], object]]] = {
 
 
 @pytest.mark.parametrize(("kind", "delay"), [*product(WRITES, ["expired", "cancelled"]), ("start", "silent")])
-def test_a_write_that_is_recorded_first_and_then_not_sent_is_recorded_as_not_sent(
+def test_an_unsent_write_that_was_recorded_has_a_second_record(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, kind: str, delay: str
 ) -> None:
     """Without the second record, the write would look as if it had been in flight when the process died."""

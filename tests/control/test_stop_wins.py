@@ -355,7 +355,7 @@ class Stops(RuleBasedStateMachine):
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", usually(*KINDS))
-def test_no_call_that_started_before_a_stop_moves_a_motor_after_it(kind: str) -> None:
+def test_a_call_before_a_stop_moves_no_motor_after_it(kind: str) -> None:
     machine = type(f"StopsOf{kind}", (Stops,), {"kind": kind})
     run_state_machine_as_test(
         machine,

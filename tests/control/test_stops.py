@@ -263,7 +263,7 @@ class Patient(Own):
         yield from read(self.speed)
 
 
-def test_the_waits_of_a_stop_script_end_at_the_time_limit_of_the_stop() -> None:
+def test_a_stop_scripts_waits_end_at_its_time_limit() -> None:
     line = SimulatedBus(simulated(Patient(1)))
     drive = line.attach(Patient(1))
     begun = line.seconds
@@ -447,7 +447,7 @@ def test_the_stops_of_a_line_share_the_wait_for_a_slow_port(
     assert line.seconds - begun < LEAST_S + 2 * 5
 
 
-def test_a_start_called_before_a_stop_is_not_sent_after_the_drive_is_attached_again() -> None:
+def test_a_start_stays_cancelled_if_the_drive_is_attached_again() -> None:
     line, (drive,), (sim,) = che_drives()
     seen = drive.stops_called[0]
     drive.stop()
@@ -583,7 +583,7 @@ def test_other_drives_are_stopped_if_a_stop_script_raises() -> None:
     assert "division by zero" in found["breaks"].why
 
 
-def test_a_stop_that_is_one_plain_write_is_repeated_until_the_drive_answers() -> None:
+def test_a_stop_with_a_single_write_is_repeated_until_it_is_answered() -> None:
     line = SimulatedBus(simulated(Own(1)))
     drive = line.attach(Own(1))
     line.deafens = lambda request: line.seconds < 1010

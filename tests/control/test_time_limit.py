@@ -116,7 +116,7 @@ def test_an_inner_time_limit_cannot_extend_the_outer_time_limit(line: SimulatedB
     line.bus.drives[0].set_frequency(20)
 
 
-def test_the_expiry_of_the_bus_applies_if_it_is_shorter_than_the_time_limit(line: SimulatedBus) -> None:
+def test_the_expiry_of_the_bus_also_applies_within_a_time_limit(line: SimulatedBus) -> None:
     line.queue_time = 1.5
     with within(line, 60), pytest.raises(Expired):
         line.bus.drives[0].set_frequency(20)

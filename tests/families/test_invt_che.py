@@ -162,7 +162,7 @@ def test_invt_che_stop_waits_for_the_state_standby() -> None:
     assert wire.reads == ["status"] * 3
 
 
-def test_invt_che_stop_jog_is_sent_at_once_if_a_jog_continues_after_a_stop() -> None:
+def test_the_command_stop_jog_is_sent_if_a_jog_continues() -> None:
     """STOP_JOG is not delayed until `stop_time` has passed."""
     wire = Wire(InvtCHE(1), {"status": CHEStatus.FORWARD}, turns={STOP_JOG: {"status": CHEStatus.STANDBY}})
     wire.drive.stop()
@@ -205,7 +205,7 @@ def test_the_command_stop_jog_follows_an_unconfirmed_stop() -> None:
     [NoReply("drive"), BadReply("drive", "checksum", b""), DriveException("drive", 6, "busy")],
     ids=lambda unseen: type(unseen).__name__,
 )
-def test_invt_che_stop_jog_is_sent_if_the_state_after_a_stop_is_unknown(unseen: BusError) -> None:
+def test_the_command_stop_jog_is_sent_if_the_state_is_unknown(unseen: BusError) -> None:
     wire = Wire(InvtCHE(1), {"status": unseen})
     with pytest.raises(type(unseen)):
         wire.drive.stop()

@@ -81,7 +81,7 @@ WRONG: list[tuple[type[Drive], dict[str, Any], str]] = [
 
 
 @table(("family", "registers", "mistake"), WRONG)
-def test_register_that_does_not_fit_its_role_in_the_profile_is_refused(
+def test_a_register_that_does_not_fit_its_profile_is_refused(
     family: type[Drive], registers: dict[str, Any], mistake: str
 ) -> None:
     with pytest.raises(DeclarationError) as wrong:
