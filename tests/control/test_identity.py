@@ -185,7 +185,7 @@ def _on_another_bus(bus: Bus, drive: Any, received: Any, monkeypatch: pytest.Mon
 
 
 def _silent_then_idle(bus: Bus, drive: Any, received: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    be_silent(bus, drive, received)  # so that an identity check precedes the start
+    be_silent(bus, drive, received)  # the start now needs an identity check
     bus.peer(drive).c.answered_ns -= 2 * PAUSE_NS
 
 
@@ -258,7 +258,7 @@ def test_a_detached_drive_is_identified_again_before_a_stop() -> None:
     bus, drive, sim = one(InvtCHE(1, maximum_frequency=50))
     odd = [build_reply(Framing.RTU, Message(1, 3, data=bytes([0, device]))) for device in (3, 4)]
     bus.answers = lambda request: odd.pop(0) if odd else None
-    drive.stop()  # it is sent, because two different wrong identities prove nothing
+    drive.stop()  # sent: two different wrong identities prove nothing
     begun = len(bus.written)
     bus.bus.detach(drive)
     bus.attach(drive)
@@ -588,7 +588,7 @@ def test_registers_of_other_makes_are_not_read_after_the_first_write() -> None:
     count_silences(line)
     drive.set_frequency(20)
     foreign = [request for request, _ in line.frames if request.start == GOODRIVE_DEVICE]
-    assert len(foreign) == 2  # twice, because the first reply may be lost by chance
+    assert len(foreign) == 2  # the second read allows for a reply lost by chance
     line.frames.clear()
     drive.start()
     drive.set_frequency(30)

@@ -25,7 +25,7 @@ from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 from multidrop.transport import clock
 from multidrop.transport import line as of_a_port
 
-BAUDRATE = 38400  # high, so that silences between frames are short
+BAUDRATE = 38400  # a high baud rate, with short silences between frames
 CODE = of_a_port.Line.carry_out.__code__
 
 

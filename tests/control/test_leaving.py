@@ -160,7 +160,7 @@ def test_attaching_a_drive_of_another_open_bus_raises() -> None:
     line.bus.detach(drive)
     other.attach(drive)
     other.bus.close()
-    line.attach(drive)  # allowed, because closing the other bus has detached the drive
+    line.attach(drive)  # closing the other bus has detached the drive
 
 
 def test_a_drive_can_be_attached_to_another_bus_while_its_bus_closes(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -236,7 +236,7 @@ def test_a_port_counts_as_simulated_until_its_simulator_is_killed(tmp_path: Path
     with BoundProcess([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         device = process.stdout.readline().strip()
-        held = os.open(device, os.O_RDWR | os.O_NOCTTY)  # keeps the pty, so that no other test gets it
+        held = os.open(device, os.O_RDWR | os.O_NOCTTY)  # keeps the pty from other tests
         try:
             assert is_simulated(device)
         finally:

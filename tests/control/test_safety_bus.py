@@ -369,7 +369,7 @@ def test_a_setpoint_loop_to_eeprom_is_refused_with_advice() -> None:
         line.sleep(1.0 - 0.04)
     assert sim.counters.eeprom_writes["frequency"] == 1
     for _ in range(100):
-        drive.set_frequency(10.0)  # not written again, because the drive holds the value
+        drive.set_frequency(10.0)  # not written again: the drive holds the value
     line.sleep(60)
     drive.set_frequency(12.0)
     assert sim.counters.eeprom_writes["frequency"] == 2

@@ -280,7 +280,7 @@ def test_an_echo_does_not_confirm_a_setpoint(family: type[Drive]) -> None:
     for write in (lambda: drive.write(drive.frequency, 25.0), lambda: drive.set_frequency(25.0)):
         with pytest.raises(Unconfirmed, match="echo"):
             write()
-        assert drive.commanded is None  # unknown, so that no start or ramp relies on it
+        assert drive.commanded is None  # unknown: no start or ramp may rely on it
 
 
 def test_a_write_is_unconfirmed_if_the_next_read_reveals_an_echo() -> None:

@@ -393,7 +393,7 @@ def check_stops(family: str, failure: str, step: int) -> None:
         sim.pass_time(line.seconds + 60)
         assert not sim.motor.energised, place
         assert not line.bus.stops_under_way(), place
-        line.bus.part()  # does not wait, because the stop is over
+        line.bus.part()  # returns at once: the stop is over
     assert nth > 80
 
 

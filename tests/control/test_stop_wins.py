@@ -44,7 +44,7 @@ from multidrop.errors import BusError
 from multidrop.poller import Poller
 
 EXAMPLES = int(os.environ.get("STOP_EXAMPLES", "2"))
-EXPIRY = 60.0  # s; long, because a busy computer is slow
+EXPIRY = 60.0  # s; long enough for a busy computer
 DRIVES = 2
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 

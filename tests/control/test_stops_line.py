@@ -278,7 +278,7 @@ def test_a_closing_poller_stops_motors_after_reopening_the_port(
             monkeypatch.setattr(clock, "sleep", waits.append)
             with pytest.raises(LineError, match="it is closed"):
                 drive.stop()
-            assert sum(waits) == 0  # no waits, because a closed port does not come back
+            assert sum(waits) == 0  # no waits: a closed port does not come back
 
 
 @pytest.mark.slow

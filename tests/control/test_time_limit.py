@@ -32,7 +32,7 @@ from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 @pytest.fixture
 def line() -> SimulatedBus:
     found, _, _ = one(InvtCHE(1, maximum_frequency=50))
-    found.bus.drives[0].set_frequency(10)  # so that later calls need no identity check
+    found.bus.drives[0].set_frequency(10)  # later calls need no identity check
     return found
 
 

@@ -103,7 +103,8 @@ class ExitTask:
     def finish(self) -> None:
         """Start the work, and wait until it is done."""
         self.begin()
-        while not self.is_over:  # short waits, so that signals received by other threads are handled
+        # The waits are short, so this thread can handle signals that other threads received.
+        while not self.is_over:
             self._over.wait(HANDLING_S)
 
     def forget(self) -> None:

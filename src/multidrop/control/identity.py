@@ -280,7 +280,7 @@ class IdentityCheck:
         def do(step: Step) -> object:
             nonlocal refused
             if isinstance(step, Wait):
-                return None  # skipped, because a stop must not be delayed
+                return None  # skipped: a stop must not be delayed
             try:
                 return self._read(drive, step, 1, insists=True)
             except DriveException as refusal:

@@ -74,7 +74,7 @@ class Seen(Enum):
     SENT = "sent but unknown"
     REFUSED = "refused by the drive"  # the drive refused every repetition of the stop
     FAILED = "failed"  # no stop was sent
-    NO_MOTOR = "has no motor"  # no stop was sent, because the device has no motor
+    NO_MOTOR = "has no motor"  # no stop was needed
 
 
 # the reason in the result of a stop whose script reads nothing after its last write

@@ -531,10 +531,12 @@ class WriteRecords:
         self.catch_up_aside()
         for thread in (_audit_thread, _ledger_thread):
             if not thread.hangs(seconds) and not thread.flush(seconds) and not thread.hangs(seconds):
-                self.catch_up()  # on this thread, because the separate thread could not be started
+                # The separate thread could not be started, so this thread does the work.
+                self.catch_up()
 
     def _write_queued(self) -> None:
-        self._writers.append(None)  # entered before a record is taken, so that `close` waits for this thread
+        # `close` waits for each thread in this list, so the entry precedes the first record.
+        self._writers.append(None)
         try:
             with suppress(IndexError):  # the queue is empty; other threads may empty it too
                 while True:

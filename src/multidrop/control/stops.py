@@ -501,7 +501,8 @@ class Stopper:
 
         try:
             return self._on_open_port(write)
-        except CheckAgain:  # repeated at once, because this call stops no other drive
+        # No other drives wait for their stops here, so the check is repeated at once.
+        except CheckAgain:
             return self._on_open_port(write)
 
     def ready(self, drive: Drive) -> float:

@@ -81,7 +81,8 @@ def plan(
     given = values if isinstance(values, ParameterSet) else ParameterSet("", values, source="values")
     family: Any = type(drive)
     check_same_model(ParameterSet(drive.model, {}, source=drive.name), given)
-    parameters_of(family)  # called because it raises Unsupported for a family without parameter addresses
+    # This call raises Unsupported for a family without parameter addresses.
+    parameters_of(family)
     space = family.parameter_space
     known = {code: parameter_of(family, code) for code in given.values if not space.is_monitor(code)}
     _check_also(family, also, given)
@@ -357,7 +358,7 @@ def _write(change: ParameterChange, call: Call, result: Applied, journal: _Journ
         check_stands(drive)
         call.check(parameter.code)
         journal.note(code=parameter.code, before=change.before, after=change.after)
-        call.check(parameter.code)  # again, because the journal's disk may be slow
+        call.check(parameter.code)  # checked again after a possible delay by a slow disk
         outcome: Outcome = drive.try_write(parameter, parameter.decode(change.after))
     except (BusError, OSError) as failure:
         if isinstance(failure, WriteForbidden) and failure.is_budget:

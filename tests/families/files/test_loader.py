@@ -614,7 +614,7 @@ def mutated(data: bytes, chosen: random.Random) -> bytes:
         piece = chosen.choice(
             (chosen.choice(WORDS), b"", data[other : other + 30], data[begin:end] * 2, chosen.randbytes(2))
         )
-        if chosen.random() < 0.4:  # replace a whole value, so that the file often stays valid TOML
+        if chosen.random() < 0.4:  # replaces a whole value: the file often stays valid TOML
             begin = data.find(b"= ", begin) + 2
             ends = [at for at in (data.find(mark, begin) for mark in (b",", b" }", b"\n")) if at > 0]
             end = min(ends, default=begin)

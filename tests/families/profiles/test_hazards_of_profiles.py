@@ -104,7 +104,7 @@ def test_a_reset_never_starts_the_motor(line: Line) -> None:
     line.bus.sleep(5)
     assert line.drive.state().condition is Condition.STOPPED
     assert not line.sim.motor.energised
-    line.sim.trip(FAULT)  # the later fault stays, because the reset bit was cleared
+    line.sim.trip(FAULT)  # the reset bit was cleared, so the later fault stays
     line.bus.sleep(1)
     assert line.drive.state().condition is Condition.FAULT
     line.drive.reset_fault()  # the later fault can be reset too
@@ -129,7 +129,7 @@ def test_a_reset_with_lost_replies_never_starts_the_motor(line: Line, lost: int)
     line.sim.trip(FAULT)
     line.bus.sleep(1)
     line.drive.state()
-    assert line.sim.motor.fault == FAULT  # the new fault stays, because the reset bit was cleared
+    assert line.sim.motor.fault == FAULT  # the reset bit was cleared, so the new fault stays
 
 
 def test_a_reset_without_a_fault_sends_no_write(line: Line) -> None:

@@ -134,7 +134,7 @@ KINDS = {
             {},
             {0x0010: 900},
             "current",
-            makes={"confirmed": 1},  # the user confirms the family, because no reply identifies it
+            makes={"confirmed": 1},  # confirmed by the user: no reply identifies the family
         ),
     )
 }

@@ -262,7 +262,7 @@ async def _live(place: Place) -> None:
 
     def tell() -> None:
         if not sys.stdin.readline():
-            loop.remove_reader(sys.stdin)  # standard input has ended, because the parent process has
+            loop.remove_reader(sys.stdin)  # the parent process has ended, and with it standard input
             task.cancel()
             return
         print(json.dumps([users.counts, users.failures]), flush=True)

@@ -30,7 +30,7 @@ from multidrop.gateway.live import frames
 from multidrop.gateway.settings import ServeSettings, read_plant, read_settings
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
 
-for module, name in (  # longer timeouts, because the test machine may be busy
+for module, name in (  # timeouts for a busy machine
     *((parts, "BUILD_S"), (reload, "READ_S")),
     *((settings_module, "AUDIT_S"), (gateway_module, "AUDIT_S"), (reload, "AUDIT_S")),
 ):

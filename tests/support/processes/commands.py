@@ -15,7 +15,7 @@ from multidrop.families.registry import find_model
 
 MULTIDROP = [sys.executable, "-m", "multidrop"]
 TOY = f"{Path(__file__).parents[1]}/drives/toy.py:Toy"
-find_model(TOY)  # load the file now, so that its log entry does not appear during a test
+find_model(TOY)  # loads the file before a test: loading makes a log entry
 Run = Callable[..., tuple[int, str, str]]
 TOY_IS_RUN = f"multidrop: {TOY.rpartition(':')[0]} is run as Python: a user's model is a program\n"
 
@@ -35,7 +35,7 @@ def multidrop(*words: object, most_bytes: int | None = None) -> subprocess.Compl
     """Run a command to its end; with `most_bytes`, files are limited to this size, like on a full disk."""
 
     def limit() -> None:
-        import resource  # imported here, because Windows has no such module
+        import resource  # imported here: Windows has no such module
 
         assert most_bytes is not None
         resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, most_bytes))

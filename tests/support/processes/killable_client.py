@@ -38,7 +38,7 @@ from multidrop.recording import open_writer
 METADATA = {"plant": "counted.toml"}
 NAME = "counted"
 DRIVE: Any = {"address": 1, "baudrate": 38400}  # the drive to which parameters are applied
-TRIES = 20  # attempts per call, because a busy machine may miss replies
+TRIES = 20  # attempts per call; a busy machine may miss replies
 
 
 class Counted(Drive):

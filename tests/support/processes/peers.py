@@ -95,7 +95,7 @@ def build_and_run(
     if shutil.which(CC) is None:
         pytest.skip(f"no C compiler ({CC})")
     sources = [f"csrc/{name}.c" for name in core]
-    random.shuffle(sources)  # so that concurrent workers compile different files first
+    random.shuffle(sources)  # concurrent workers compile different files first
     parts = [compiled(source, objects, sanitizers) for source in (f"tests/c/{program.name}.c", *sources)]
     _run([CC, *sanitizers, *parts, "-lm", "-o", program])
     run = subprocess.run([program, *arguments], cwd=ROOT, capture_output=True, text=True, check=False)

@@ -284,7 +284,7 @@ class ClockedLine:
         return self
 
     regain = reopen  # the poller has already closed the lost port
-    is_lost = False  # unused, because no test here stops a motor
+    is_lost = False  # unused: no test here stops a motor
 
 
 class ClockedLines:

@@ -44,7 +44,7 @@ def until(met: Callable[[], Any], patience: float = PATIENCE) -> None:
     while not met():
         assert monotonic() < end, f"not met within {patience:g} s"
         sleep(pause_s)
-        pause_s = min(1.2 * pause_s, 0.04)  # check less and less often, because a check may be costly
+        pause_s = min(1.2 * pause_s, 0.04)  # checks become rarer, as a check may be costly
 
 
 class Faulty(Wire):

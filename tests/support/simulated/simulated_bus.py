@@ -98,7 +98,7 @@ class SimulatedBus:
 
     is_lost = is_stalled = is_tcp = False
     why_closing = ""
-    may_send = True  # True, because this bus has no mastership that could be lost
+    may_send = True  # always True: this bus needs no right to send
 
     def open(self) -> SimulatedBus:
         return self

@@ -78,7 +78,7 @@ POLLED = (
 )
 # addresses of the first polled reading, and of a register that is not polled
 FIRST_READING, UNPOLLED = 0x2100, 0x0900
-RAMP_S = 0.2  # deceleration time in s; short, because `stop` returns only when the motor is at rest
+RAMP_S = 0.2  # deceleration time in s; `stop` waits for its end
 WAVE_S = 0.1  # time between two changes of load and speed, in s
 
 

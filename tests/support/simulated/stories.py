@@ -228,7 +228,7 @@ class PathLine:
         self.now = BEGIN_NS
         self.wire = wire
         self.has_echo = self.is_lost = self.is_stalled = False
-        self.may_send = True  # True, because this line has no mastership that could be lost
+        self.may_send = True  # always True: this line needs no right to send
         self.is_tcp, self.ids = speaks_tcp(self.port), wire.ids
         self.queue = ClockedPort(self, transactions_of(self))
 

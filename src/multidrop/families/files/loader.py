@@ -225,7 +225,7 @@ def bases(key: str) -> Mapping[str, type[Drive]]:
     """Return the base classes, by name, that the key "profile" or "extends" can name."""
     if key == "extends":
         return MODELS
-    from multidrop.families.profiles import PROFILES  # imported here, because few files use a profile
+    from multidrop.families.profiles import PROFILES  # imported only for the few files with a profile
 
     return PROFILES
 

@@ -41,7 +41,7 @@ class Role:
     never_together: tuple[int, ...] = ()
     moves: bool | None = None
     units: tuple[str, ...] = ()  # allowed units; empty: any
-    extra: tuple[str, ...] = ()  # names of bits that a family may add, because makes differ in these bits
+    extra: tuple[str, ...] = ()  # names of bits, different in each make, that a family may add
     # control words, such as "stop", that a family must list if it has raw counts of its own
     renumbered: tuple[str, ...] = ()
     needed: bool = True
