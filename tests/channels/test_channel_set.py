@@ -44,7 +44,7 @@ ENERGY = Channel("energy", "integral(power)", "kWh")
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in range(1, 10))])
-def test_energy_total_equals_the_analytic_integral_although_5_percent_are_missing(seed: int) -> None:
+def test_the_energy_total_equals_the_analytic_integral_although_5_percent_are_missing(seed: int) -> None:
     """The power is 2 + sin(t / 7 s) kW for 10 minutes, read about every 100 ms."""
     random_, made = missing(0.05, seed), channels(ENERGY, power="kW")
     rows, missed = [], 0
@@ -61,7 +61,7 @@ def test_energy_total_equals_the_analytic_integral_although_5_percent_are_missin
 
 
 @table("flow_unit, unit, total", [("m3/h", "m3", 0.5), ("m3/h", "l", 500.0), ("l/min", "m3", 0.03)])
-def test_volume_is_the_integral_of_a_flow(flow_unit: str, unit: str, total: float) -> None:
+def test_the_volume_is_the_integral_of_a_flow(flow_unit: str, unit: str, total: float) -> None:
     """A pump at 25 Hz delivers 5 of the flow's unit for 6 minutes, after a table of its curve."""
     flow = Channel("flow", f'table(frequency, "{flow_unit}", 0, 0, 50, 10)', flow_unit)
     made = channels(flow, Channel("volume", "integral(flow)", unit), frequency="Hz")
@@ -69,7 +69,7 @@ def test_volume_is_the_integral_of_a_flow(flow_unit: str, unit: str, total: floa
     assert [one.value for one in found if one.slot == 2][-1] == pytest.approx(total)
 
 
-def test_outage_is_reported_and_adds_nothing_to_a_computed_total() -> None:
+def test_an_outage_is_reported_and_adds_nothing_to_a_computed_total() -> None:
     made = channels(ENERGY, power="kW")
     assert last_value(made, [row(0, at, 3600.0) for at in (0.0, 1.0)]) == 1.0
     silent = made.compute([row(0, at, None) for at in (2.0, 3.0, 4.0)])
@@ -81,7 +81,7 @@ def test_outage_is_reported_and_adds_nothing_to_a_computed_total() -> None:
     assert str(weekend) == "pump.energy: 216000 s without values are not counted"
 
 
-def test_total_continues_across_missing_values_within_the_holding_time() -> None:
+def test_a_total_continues_across_missing_values_within_the_holding_time() -> None:
     made = channels(ENERGY, power="kW")
     rows = [row(0, 0.0, 3600.0), row(0, 0.5, None), row(0, 1.0, 7200.0)]
     assert last_value(made, rows) == 1.5
@@ -94,7 +94,7 @@ def test_total_continues_across_missing_values_within_the_holding_time() -> None
     ids=["without rows", "with a miss"],
 )
 @table("value", ["integral(power + pump-2.power)", "integral(both)"])
-def test_total_has_an_outage_while_the_value_of_another_line_is_too_old(
+def test_a_total_has_an_outage_while_the_value_of_another_line_is_too_old(
     value: str, misses: list[SlotRow], status: int, known_until_s: int
 ) -> None:
     """Each of two drives has a power of 1800 kW, and values are valid for 30 s. One is silent for 40 s."""
@@ -120,14 +120,14 @@ def test_run_hours_and_number_of_starts_are_computed() -> None:
     assert found[-2].value == pytest.approx((1 + 0.5 + 0.5 + 0.5 + 0.5 + 1) / 3600)
 
 
-def test_derivative_needs_two_values_without_an_outage_between_them() -> None:
+def test_a_derivative_needs_two_values_without_an_outage_between_them() -> None:
     made = channels(Channel("slope", "derivative(frequency)", "Hz/s"), frequency="Hz")
     found = made.compute([row(0, 0.0, 10.0), row(0, 0.5, 15.0), row(0, 5.0, 0.0), row(0, 5.5, 1.0)])
     shown = [(one.value, one.status) for one in found]
     assert shown == [(0.0, Status.NO_VALUE), (10.0, 0), (0.0, Status.NO_VALUE), (2.0, 0)]
 
 
-def test_computed_row_has_the_status_and_time_of_the_newest_missing_value() -> None:
+def test_a_computed_row_has_the_status_and_time_of_the_newest_missing_value() -> None:
     made = channels(Channel("power", "voltage * current", "W"), voltage="V", current="A")
     assert made.compute([row(0, 1.0, 400.0)]) == []  # the register with the current has no value yet
     (first,) = made.compute([row(0, 2.0, 400.0), row(1, 2.0, 2.0)])  # one request
@@ -144,7 +144,7 @@ def test_each_of_several_rows_with_the_same_time_gives_a_computed_row() -> None:
     assert [one.status for one in found] == [Status.NO_REPLY, Status.NO_REPLY, Status.OK]
 
 
-def test_expression_may_use_a_channel_that_was_declared_earlier() -> None:
+def test_an_expression_may_use_a_channel_that_was_declared_earlier() -> None:
     made = channels(
         Channel("power", "u * i", "kW"), Channel("energy", "integral(power)", "kWh"), u="V", i="A"
     )
@@ -169,7 +169,7 @@ def test_computed_totals_are_exact_after_a_restart() -> None:
     assert str(second.outages[0]) == "pump.energy: 0.143 s without values are not counted"
 
 
-def test_reload_of_the_plant_continues_totals_without_an_outage() -> None:
+def test_a_reload_of_the_plant_continues_totals_without_an_outage() -> None:
     values = [row(0, at / 7, 3 * random.Random(at).random()) for at in range(100)]
     whole, first, second = (channels(ENERGY, power="kW") for _ in range(3))
     whole.compute(values)
@@ -197,7 +197,7 @@ def test_an_integral_skips_the_time_while_a_drive_is_replaced() -> None:
     assert list(map(str, second.outages)) == ["pump.energy: 0.5 s without values are not counted"]
 
 
-def test_total_with_a_changed_expression_or_damaged_file_starts_at_0() -> None:
+def test_a_total_with_a_changed_expression_or_damaged_file_starts_at_0() -> None:
     before = channels(ENERGY, power="kW")
     before.compute([row(0, at, 3600.0) for at in (0.0, 1.0)])
     good = before.totals()["pump.energy"]
@@ -215,14 +215,14 @@ def test_total_with_a_changed_expression_or_damaged_file_starts_at_0() -> None:
 
 
 @table("time_ns", [1 << 63, 10**400, None, "1"], ids=["late", "huge", "none", "text"])
-def test_saved_total_with_an_invalid_time_is_restored(time_ns: object) -> None:
+def test_a_saved_total_with_an_invalid_time_is_restored(time_ns: object) -> None:
     made = channels(ENERGY, power="kW")
     kept = {"value": ENERGY.value, "units": ["kW*s"], "totals": [[7200.0]], "time_ns": time_ns}
     assert made.restore({"pump.energy": kept}) == []
     assert last_value(made, [row(0, 0.0, 1.0)]) == 2.0
 
 
-def test_total_that_is_declared_as_not_kept_starts_at_0_after_a_restart() -> None:
+def test_a_total_that_is_declared_as_not_kept_starts_at_0_after_a_restart() -> None:
     kept, other = channels(ENERGY, power="kW"), channels(replace(ENERGY, is_kept=False), power="kW")
     for made in (kept, other):
         made.compute([row(0, at, 3600.0) for at in (0.0, 1.0)])
@@ -238,7 +238,7 @@ def test_several_outages_before_the_next_value_are_reported_together() -> None:
     assert list(map(str, made.outages)) == ["pump.both: 10 s without values are not counted"]
 
 
-def test_infinite_value_does_not_destroy_a_computed_total() -> None:
+def test_an_infinite_value_does_not_destroy_a_computed_total() -> None:
     made = channels(ENERGY, power="kW")
     rows = [row(0, 0.0, 3600.0), row(0, 1.0, 3600.0), row(0, 1.5, math.inf), row(0, 2.0, 3600.0)]
     assert last_value(made, rows) == pytest.approx(2)
@@ -252,7 +252,7 @@ def test_infinite_value_does_not_destroy_a_computed_total() -> None:
         ("x" * 101, "a channel's name and its unit have at most 100 characters each"),
     ],
 )
-def test_invalid_name_of_a_computed_channel_is_reported(name: str, sentence: str) -> None:
+def test_an_invalid_name_of_a_computed_channel_is_reported(name: str, sentence: str) -> None:
     made = ChannelSet(
         [DriveSeries("pump", {"power": ("kW", 1.0)}, {"power"}, [Channel(name, "power", "kW")])]
     )

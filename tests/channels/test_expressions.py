@@ -86,7 +86,7 @@ def value_of(text: str, unit: str = "") -> float | None:
         ("status * .5e1", "", 15.0),
     ],
 )
-def test_channel_expression_has_the_expected_value(expression: str, unit: str, value: float) -> None:
+def test_a_channel_expression_has_the_expected_value(expression: str, unit: str, value: float) -> None:
     assert value_of(expression, unit) == pytest.approx(value, rel=1e-12)
 
 
@@ -99,7 +99,7 @@ def test_channel_expression_has_the_expected_value(expression: str, unit: str, v
         "current / (status - 3) > 1 or status > 3",
     ],
 )
-def test_channel_expression_without_a_finite_result_has_no_value(expression: str) -> None:
+def test_a_channel_expression_without_a_finite_result_has_no_value(expression: str) -> None:
     assert value_of(expression, "A" if "current" in expression and ">" not in expression else "") is None
 
 
@@ -141,7 +141,7 @@ MISTAKES = {
 
 
 @table("expression", MISTAKES)
-def test_mistake_in_a_channel_expression_is_reported_with_its_column(expression: str) -> None:
+def test_a_mistake_in_a_channel_expression_is_reported_with_its_column(expression: str) -> None:
     with pytest.raises(ExpressionError) as mistake:
         value_of(expression)
     assert str(mistake.value).startswith(MISTAKES[expression])
@@ -160,7 +160,7 @@ def test_mistake_in_a_channel_expression_is_reported_with_its_column(expression:
         *(('as(current, "mW")', "mW", ""), ('as(current, "nm")', "nm", ""), ('as(current, "S")', "S", "")),
     ],
 )
-def test_unit_with_wrong_upper_or_lower_case_is_refused_with_the_right_unit(
+def test_a_unit_with_wrong_upper_or_lower_case_is_refused_with_the_right_unit(
     expression: str, unit: str, hint: str
 ) -> None:
     if not hint:
@@ -179,7 +179,7 @@ def test_unit_with_wrong_upper_or_lower_case_is_refused_with_the_right_unit(
         ("sqrt(1 / (current * current))", "1/A", 0.25),
     ],
 )
-def test_unit_suggested_by_the_error_is_accepted(expression: str, unit: str, value: float) -> None:
+def test_a_unit_suggested_by_the_error_is_accepted(expression: str, unit: str, value: float) -> None:
     with pytest.raises(ExpressionError, match=f'add unit = "{re.escape(unit)}"$'):
         value_of(expression)
     assert value_of(expression, unit) == pytest.approx(value)
@@ -295,7 +295,7 @@ LONGEST = {  # near the limits of length and depth
 
 
 @pytest.mark.parametrize("kind", LONGEST)
-def test_work_of_an_evaluation_is_bounded_by_the_length_of_the_text(kind: str) -> None:
+def test_the_work_of_an_evaluation_is_bounded_by_the_length_of_the_text(kind: str) -> None:
     """Count the lines of Python code that one evaluation executes, instead of its time."""
     text = LONGEST[kind]
     series = SeriesTable(PUMPS)

@@ -147,11 +147,11 @@ def test_the_help_imports_no_command_and_no_large_library() -> None:
         ),
     ],
 )
-def test_mistaken_commands_print_a_sentence_and_return_2(run: Run, words: list[str], sentence: str) -> None:
+def test_wrong_commands_print_a_sentence_and_return_2(run: Run, words: list[str], sentence: str) -> None:
     assert run(*words) == (2, "", f"multidrop: {sentence}\n")
 
 
-def test_version_prints_the_version_of_the_package(run: Run) -> None:
+def test_the_version_option_prints_the_version_of_the_package(run: Run) -> None:
     assert run("--version") == (0, f"multidrop {version('multidrop')}\n", "")
 
 
@@ -192,7 +192,7 @@ def test_an_invalid_polling_time_is_reported_in_one_sentence(run: Run, seconds: 
     assert f"argument --seconds: '{seconds}' is not a number of seconds above 0" in err
 
 
-def test_a_reports_file_name_must_end_in_html(run: Run, tmp_path: Path) -> None:
+def test_the_file_name_of_a_report_must_end_in_html(run: Run, tmp_path: Path) -> None:
     (tmp_path / "a.csv").touch()
     status, _, err = run("report", tmp_path / "a.csv", "--out", tmp_path / "a.txt")
     assert (status, err) == (2, f"multidrop: {tmp_path / 'a.txt'}: a report's name must end in .html\n")
@@ -205,7 +205,7 @@ def test_a_reports_file_name_must_end_in_html(run: Run, tmp_path: Path) -> None:
         ("a", "plant.toml", "--ports plant.toml is a file: name a directory; it is created if missing"),
     ],
 )
-def test_ports_that_cannot_be_linked_are_refused(
+def test_a_port_that_cannot_be_linked_is_refused(
     run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str, ports: str, sentence: str
 ) -> None:
     drive = '[[line.drive]]\nname = "a"\naddress = 1\nmodel = "yd1000"\n'

@@ -227,7 +227,9 @@ def test_a_setpoint_written_in_percent_is_shown_in_percent(run: Run) -> None:
     assert "set-frequency done at setpoint = 24.69 %;" in out
 
 
-def test_start_stop_and_set_frequency_write_to_the_drive(run: Run, port: str, toy: SimulatedDrive) -> None:
+def test_the_commands_start_stop_and_set_frequency_write_to_the_drive(
+    run: Run, port: str, toy: SimulatedDrive
+) -> None:
     assert run("start", port, TOY, 1, "--direction", "reverse", "--yes") == (
         0,
         f"toy@1: start done; state: running; {DOG}\n",
@@ -241,7 +243,7 @@ def test_start_stop_and_set_frequency_write_to_the_drive(run: Run, port: str, to
 
 
 @pytest.mark.slow
-def test_starting_a_drive_with_unreadable_setpoint_needs_a_frequency(run: Run) -> None:
+def test_a_start_of_a_drive_with_unreadable_setpoint_needs_a_frequency(run: Run) -> None:
     """A command does not know the setpoint that an earlier command has written."""
     with Simulator([Wire([simulated(InnovertIBD(1))], unpaced=True)]) as simulator:
         words = (simulator.wires[0].path, "innovert-ibd", 1, "--yes")
@@ -251,7 +253,7 @@ def test_starting_a_drive_with_unreadable_setpoint_needs_a_frequency(run: Run) -
 
 
 @patient
-def test_start_writes_the_setpoint_first(run: Run, port: str, toy: SimulatedDrive) -> None:
+def test_the_start_command_writes_the_setpoint_first(run: Run, port: str, toy: SimulatedDrive) -> None:
     assert run("start", port, TOY, 1, "--frequency", 20, "--yes")[0] == 0
     assert [write.name for write in toy.counters.writes] == ["frequency", "control"]
 
@@ -283,7 +285,7 @@ def test_a_suspended_process_sends_no_start(run: Run, monkeypatch: pytest.Monkey
 
 @patient
 @pytest.mark.parametrize(("answer", "writes"), [("y", 1), ("yes", 1), ("n", 0), ("", 0), ("start", 0)])
-def test_on_a_terminal_a_start_is_confirmed_or_not_sent(
+def test_a_start_is_confirmed_on_a_terminal_or_not_sent(
     run: Run, port: str, toy: SimulatedDrive, monkeypatch: pytest.MonkeyPatch, answer: str, writes: int
 ) -> None:
     terminal = io.StringIO(answer + "\n")

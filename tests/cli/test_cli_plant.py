@@ -149,7 +149,9 @@ def test_the_write_command_accepts_plant_file_and_drive_name(
     assert toy["frequency"] == 25
 
 
-def test_verbs_accept_plant_file_and_drive_name(run: Run, plant: Path, at: str, toy: SimulatedDrive) -> None:
+def test_each_verb_accepts_a_plant_file_and_a_drive_name(
+    run: Run, plant: Path, at: str, toy: SimulatedDrive
+) -> None:
     drive = (plant, "pump-1", at)
     assert run("state", *drive)[1].startswith("stopped\n")
     assert run("set-frequency", *drive, "33.5", "--yes")[0] == 0
@@ -230,14 +232,14 @@ def test_the_models_command_shows_the_family_of_a_drive_in_a_plant(run: Run, pla
     )
 
 
-def test_poll_replaces_ports_by_the_port_option(run: Run, port: str, tmp_path: Path) -> None:
+def test_the_port_option_of_the_poll_command_replaces_ports(run: Run, port: str, tmp_path: Path) -> None:
     plant = one_line(tmp_path, "/dev/none-1")
     assert run("poll", plant, "--seconds", "0.2")[0] == 1
     status, out, _ = run("poll", plant, "--seconds", "0.2", "--json", f"--port=hall-1={port}")
     assert (status, json.loads(out)["samples"] > 0) == (0, True)
 
 
-def test_monitor_accepts_the_port_option(run: Run, plant: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_monitor_accepts_the_port_option(run: Run, plant: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shown: list[str] = []
 
     def watch(watched: Plant, **_: object) -> dict[str, int]:
@@ -251,7 +253,7 @@ def test_monitor_accepts_the_port_option(run: Run, plant: Path, monkeypatch: pyt
 
 
 @pytest.mark.slow
-def test_scan_accepts_a_plant_file_and_a_line(run: Run, plant: Path, port: str, at: str) -> None:
+def test_the_scan_command_accepts_a_plant_file_and_a_line(run: Run, plant: Path, port: str, at: str) -> None:
     few = ("--model", TOY, "--addresses", "1", "--baudrates", "9600", "--formats", "8N1", "--json")
     status, out, _ = run("scan", plant, "hall-1", at, *few)
     assert status == 0
@@ -265,7 +267,7 @@ def test_scan_accepts_a_plant_file_and_a_line(run: Run, plant: Path, port: str, 
 
 
 @pytest.mark.slow
-def test_doctor_measures_with_the_drives_of_a_plant(run: Run, plant: Path, port: str, at: str) -> None:
+def test_the_doctor_command_uses_the_drives_of_a_plant(run: Run, plant: Path, port: str, at: str) -> None:
     def findings(*words: object) -> dict[str, str]:
         record = json.loads(run("doctor", plant, *words, at, "--json")[1])
         assert record["port"] == port
@@ -280,7 +282,7 @@ def test_doctor_measures_with_the_drives_of_a_plant(run: Run, plant: Path, port:
     assert "--model is not for plant files" in run("doctor", plant, "pump-1", "--model", TOY)[2]
 
 
-def test_sniff_accepts_a_plant_file_and_a_line(run: Run, plant: Path, at: str) -> None:
+def test_the_sniff_command_accepts_a_plant_file_and_a_line(run: Run, plant: Path, at: str) -> None:
     status, out, err = run("sniff", plant, "hall-1", at, "--seconds", "0.2")
     assert (status, out) == (0, "0 exchanges, 0 unknown bytes\n")
     assert err.startswith("listening on /dev/pts/")
@@ -288,7 +290,7 @@ def test_sniff_accepts_a_plant_file_and_a_line(run: Run, plant: Path, at: str) -
     assert "is a plant file already" in run("sniff", plant, "roof", "--plant", plant, "--seconds", "0.2")[2]
 
 
-def test_models_are_found_relative_to_the_plant_file(
+def test_a_model_is_found_relative_to_the_plant_file(
     run: Run, port: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The working directory does not matter, and a model's file may import a module beside it."""
@@ -305,7 +307,9 @@ def test_models_are_found_relative_to_the_plant_file(
     assert (status, out) == (0, "output_current  3.25  A\n")
 
 
-def test_plant_files_do_not_alter_which_writes_are_refused(run: Run, plant: Path, at: str, port: str) -> None:
+def test_a_plant_file_does_not_alter_which_writes_are_refused(
+    run: Run, plant: Path, at: str, port: str
+) -> None:
     """Each command names the drive first by plant file, then by port. The errors must be equal."""
     for command, further in (
         ("write", ("control", "RUNNING", "--yes")),
@@ -349,7 +353,7 @@ def test_a_family_file_in_place_of_a_plant_file_is_refused(run: Run, tmp_path: P
 
 
 @pytest.mark.parametrize("words", [[], ["--all"], ["--line", "hall-1"]])
-def test_stop_of_a_plant_or_line_stops_all_its_drives(
+def test_a_stop_of_a_plant_or_line_stops_all_its_drives(
     run: Run, plant: Path, at: str, toy: SimulatedDrive, words: list[str]
 ) -> None:
     toy["control"] = Status.RUNNING
@@ -430,7 +434,7 @@ def test_a_drive_can_be_stopped_although_its_polled_registers_have_a_mistake(
     assert toy["control"] == 0
 
 
-def test_drive_with_a_mistake_in_its_own_table_is_not_stopped(run: Run, tmp_path: Path, port: str) -> None:
+def test_a_drive_with_a_mistake_in_its_own_table_is_not_stopped(run: Run, tmp_path: Path, port: str) -> None:
     plant = tmp_path / "wrong.toml"
     drives = DRIVE.format("pump-1", TOY, 1) + DRIVE.format("fan-9", "no-such-model", 9)
     plant.write_text(LINE.format("hall-1", port) + drives)

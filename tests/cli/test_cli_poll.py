@@ -44,7 +44,9 @@ with simulator(Path(sys.argv[1]), Path(sys.argv[2])):
 """
 
 
-def test_poll_can_request_realtime_scheduling(run: Run, plant: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_poll_command_can_request_realtime_scheduling(
+    run: Run, plant: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     asked: list[bool] = []
     monkeypatch.setattr("multidrop.core.port._Engine.set_realtime", lambda *words: asked.append(words[-1]))
     run("poll", plant, "--seconds", 0.01, "--json")
@@ -58,7 +60,9 @@ def test_poll_can_request_realtime_scheduling(run: Run, plant: Path, monkeypatch
 
 @pytest.mark.long
 @pytest.mark.parametrize("number", usually(signal.SIGINT, signal.SIGTERM))
-def test_simulate_runs_until_interrupted_and_removes_its_links(tmp_path: Path, number: int) -> None:
+def test_the_simulate_command_runs_until_interrupted_and_removes_its_links(
+    tmp_path: Path, number: int
+) -> None:
     link = tmp_path / "ports" / "hall-1"
     with running("simulate", plant_file(tmp_path), "--ports", tmp_path / "ports") as (process, out):
         out.readline()
@@ -68,7 +72,7 @@ def test_simulate_runs_until_interrupted_and_removes_its_links(tmp_path: Path, n
     assert not link.is_symlink()
 
 
-def test_simulate_does_not_replace_a_file_by_a_port_link(run: Run, tmp_path: Path) -> None:
+def test_the_simulate_command_does_not_replace_a_file_by_a_link(run: Run, tmp_path: Path) -> None:
     link = tmp_path / "ports" / "hall-1"
     link.parent.mkdir()
     link.write_text("mine")
@@ -82,7 +86,7 @@ def test_simulate_does_not_replace_a_file_by_a_port_link(run: Run, tmp_path: Pat
 
 @pytest.mark.long
 @pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo-terminals")
-def test_simulate_replaces_the_link_of_a_killed_simulator(tmp_path: Path) -> None:
+def test_the_simulate_command_replaces_the_link_of_a_killed_simulator(tmp_path: Path) -> None:
     link = tmp_path / "ports" / "hall-1"
     link.parent.mkdir()
     link.symlink_to("/dev/pts/987654")
@@ -93,7 +97,7 @@ def test_simulate_replaces_the_link_of_a_killed_simulator(tmp_path: Path) -> Non
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_simulate_applies_the_faults_of_its_file(tmp_path: Path) -> None:
+def test_the_simulate_command_applies_the_faults_of_its_file(tmp_path: Path) -> None:
     faults, ports = tmp_path / "faults.toml", tmp_path / "ports"
     faults.write_text("drop = 1\n")
     words = ["simulate", plant_file(tmp_path), "--ports", ports, "--unpaced", "--faults", faults]
@@ -104,7 +108,9 @@ def test_simulate_applies_the_faults_of_its_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_poll_records_segments_and_continues_after_a_restart(run: Run, plant: Path, tmp_path: Path) -> None:
+def test_the_poll_command_records_segments_and_continues_after_a_restart(
+    run: Run, plant: Path, tmp_path: Path
+) -> None:
     counted = 0
     words = ["--out", tmp_path / "run.arrows", "--rotate", "1 s"]
     for _ in range(2):  # the second run continues the recording
@@ -148,7 +154,9 @@ def test_the_commands_convert_and_report_ask_for_one_segment_file(run: Run, tmp_
         (["--pre", "1 s"], "--pre and --post belong to a trigger"),
     ],
 )
-def test_invalid_recording_options_are_named(run: Run, plant: Path, words: list[str], sentence: str) -> None:
+def test_invalid_recording_options_are_named_in_the_error(
+    run: Run, plant: Path, words: list[str], sentence: str
+) -> None:
     status, out, told = run("poll", plant, *words)
     assert (status, out) == (2, "")
     assert sentence in told
@@ -209,7 +217,9 @@ def test_a_recording_made_by_poll_describes_its_registers(run: Run, plant: Path,
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("number", usually(signal.SIGINT, signal.SIGTERM))
-def test_poll_ended_by_a_signal_keeps_its_recording(plant: Path, tmp_path: Path, number: int) -> None:
+def test_a_poll_command_ended_by_a_signal_keeps_its_recording(
+    plant: Path, tmp_path: Path, number: int
+) -> None:
     out = tmp_path / "out.csv"
     with running("poll", plant, "--out", out, "--json") as (process, printed):
         while not out.exists() or out.stat().st_size < 2000:
@@ -239,7 +249,7 @@ def test_the_poll_summary_compares_predicted_and_measured_rates_as_text(run: Run
 
 
 @pytest.mark.slow
-def test_poll_puts_prediction_and_measurement_side_by_side(run: Run, plant: Path) -> None:
+def test_the_poll_command_prints_prediction_and_measurement_side_by_side(run: Run, plant: Path) -> None:
     summary = json.loads(run("poll", plant, "--seconds", 0.5, "--json")[1])["lines"]["hall-1"]
     found = summary["comparison"]
     planned = json.loads(run("plan", plant, "--json")[1])["lines"]["hall-1"]
@@ -265,14 +275,14 @@ def test_no_bus_cycle_is_measured_if_a_drive_has_a_polling_period(run: Run, plan
 
 
 @pytest.mark.slow
-def test_poll_without_any_sample_returns_1(run: Run, plant: Path) -> None:
+def test_a_poll_command_without_any_sample_returns_1(run: Run, plant: Path) -> None:
     text = plant.read_text().replace("address = 1\n", "address = 8\n")
     plant.write_text(text)
     status, out, _ = run("poll", plant, "--seconds", 0.5, "--json")
     assert (status, json.loads(out)["samples"]) == (1, 0)
 
 
-def test_poll_prints_all_mistakes_of_a_plant_file(run: Run, tmp_path: Path) -> None:
+def test_the_poll_command_prints_all_mistakes_of_a_plant_file(run: Run, tmp_path: Path) -> None:
     path = plant_file(tmp_path)
     path.write_text(
         path.read_text().replace("port =", "prot =").replace("address = 1", "address = 99\nevery = 5\n")
@@ -291,7 +301,7 @@ def test_poll_prints_all_mistakes_of_a_plant_file(run: Run, tmp_path: Path) -> N
     ]
 
 
-def test_poll_and_convert_never_overwrite_a_recording(run: Run, tmp_path: Path) -> None:
+def test_the_commands_poll_and_convert_never_overwrite_a_recording(run: Run, tmp_path: Path) -> None:
     out = tmp_path / "out.csv"
     out.write_text("mine")
     sentence = f"multidrop: {out} exists already: name another file, or remove it first\n"
@@ -328,7 +338,7 @@ def test_a_full_disk_ends_polling_and_keeps_the_earlier_rows(plant: Path, tmp_pa
     assert done.stderr.count("\n") == 1
 
 
-def test_poll_reports_a_missing_port_in_one_sentence(run: Run, tmp_path: Path) -> None:
+def test_the_poll_command_reports_a_missing_port_in_one_sentence(run: Run, tmp_path: Path) -> None:
     sentence = f"multidrop: {tmp_path}/ports/hall-1: there is no such port\n"
     out = tmp_path / "out.csv"
     assert run("poll", plant_file(tmp_path), "--seconds", 1, "--out", out) == (1, "", sentence)
@@ -336,7 +346,7 @@ def test_poll_reports_a_missing_port_in_one_sentence(run: Run, tmp_path: Path) -
 
 
 @pytest.mark.slow
-def test_convert_keeps_every_row(run: Run, plant: Path, tmp_path: Path) -> None:
+def test_a_converted_recording_has_every_row(run: Run, plant: Path, tmp_path: Path) -> None:
     run("poll", plant, "--seconds", 0.3, "--out", tmp_path / "a.arrows")
     rows = recorded(tmp_path / "a.arrows")
     status, out, _ = run("convert", tmp_path / "a.arrows", tmp_path / "b.csv")
@@ -347,7 +357,9 @@ def test_convert_keeps_every_row(run: Run, plant: Path, tmp_path: Path) -> None:
 @pytest.mark.long
 @pytest.mark.usefixtures("_unpainted")
 @pytest.mark.parametrize("suffix", usually(".arrows", ".csv"))
-def test_convert_warns_of_a_recording_with_a_missing_end(run: Run, tmp_path: Path, suffix: str) -> None:
+def test_the_convert_command_warns_of_a_recording_with_a_missing_end(
+    run: Run, tmp_path: Path, suffix: str
+) -> None:
     path = tmp_path / f"a{suffix}"
     with open_writer(path, METADATA) as writer:
         for at in range(3):
@@ -366,7 +378,7 @@ def test_convert_warns_of_a_recording_with_a_missing_end(run: Run, tmp_path: Pat
     assert run("report", path) == (0, f"{tmp_path}/a.html\n", sentence)
 
 
-def test_convert_refuses_a_file_that_is_not_a_recording(run: Run, tmp_path: Path) -> None:
+def test_the_convert_command_refuses_a_file_that_is_not_a_recording(run: Run, tmp_path: Path) -> None:
     (tmp_path / "a.arrows").write_text("hello")
     status, out, err = run("convert", tmp_path / "a.arrows", tmp_path / "b.csv")
     assert (status, out) == (2, "")
@@ -376,7 +388,7 @@ def test_convert_refuses_a_file_that_is_not_a_recording(run: Run, tmp_path: Path
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_demo_reads_every_variant_of_every_family(tmp_path: Path) -> None:
+def test_the_demo_reads_every_variant_of_every_family(tmp_path: Path) -> None:
     """The demo also replaces the recording of an earlier demo, and captures its traffic."""
     out, capture = tmp_path / "demo.arrows", tmp_path / "demo.pcapng"
     with open_writer(out, {"drives": dict.fromkeys(DRIVES)}):
@@ -445,7 +457,7 @@ def test_a_killed_demo_leaves_no_simulator(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_poll_records_each_trigger_in_its_own_file(run: Run, plant: Path, tmp_path: Path) -> None:
+def test_the_poll_command_records_each_trigger_in_its_own_file(run: Run, plant: Path, tmp_path: Path) -> None:
     condition = "integral(pump-1.output_current >= 0) > 0.3"
     options = ("--trigger", condition, "--trigger", "fault", "--pre", "100 ms", "--post", "200 ms")
     for number in (1, 2):  # each run starts the integral of the trigger's condition at 0
@@ -463,7 +475,7 @@ def test_poll_records_each_trigger_in_its_own_file(run: Run, plant: Path, tmp_pa
 
 
 @pytest.mark.slow
-def test_poll_records_a_fault_and_a_changed_value(run: Run, tmp_path: Path) -> None:
+def test_the_poll_command_records_a_fault_and_a_changed_value(run: Run, tmp_path: Path) -> None:
     """The simulated drive trips once after 30 requests. Nothing else changes, so there are two triggers."""
     with simulated_test(write_test(tmp_path)) as (_, (fan,)):
         answer = fan.answer

@@ -56,7 +56,7 @@ def port(request: pytest.FixtureRequest) -> Iterator[str]:
 
 
 @pytest.mark.slow
-def test_scan_prints_each_finding(run: Run, port: str) -> None:
+def test_the_scan_command_prints_each_finding(run: Run, port: str) -> None:
     status, out, err = run("scan", port, *PATIENTLY, *TWO_MODELS)
     assert status == 0
     *told, summary = out.splitlines()
@@ -70,7 +70,7 @@ def test_scan_prints_each_finding(run: Run, port: str) -> None:
 
 
 @pytest.mark.slow
-def test_scan_prints_one_json_object(run: Run, port: str) -> None:
+def test_the_scan_command_prints_one_json_object(run: Run, port: str) -> None:
     status, out, _ = run("scan", port, *PATIENTLY, "--model", "invt-che", "--json")
     told = json.loads(out)
     assert status == 0
@@ -115,7 +115,7 @@ def test_a_scan_without_findings_returns_1_and_writes_no_file(run: Run, port: st
 
 @pytest.mark.long
 @pytest.mark.parametrize("port", ["socket://127.0.0.1:0"], indirect=True)
-def test_scanning_a_serial_server_needs_its_baud_rate(run: Run, port: str) -> None:
+def test_a_scan_of_a_serial_server_needs_its_baud_rate(run: Run, port: str) -> None:
     status, _, err = run("scan", port, "--quick")
     assert status == 2
     assert "name this rate, such as --baudrates 9600" in err
@@ -214,7 +214,7 @@ def test_every_kind_of_scan_result_is_printed_as_a_sentence() -> None:
     assert sentence(Untried(USUAL, Framing.RTU, "no parity")) == "not asked at 9600 8N1 rtu: no parity"
 
 
-def test_doubts_about_a_found_drive_are_comments_in_the_plant_file(tmp_path: Path) -> None:
+def test_each_doubt_about_a_found_drive_is_a_comment_in_the_plant_file(tmp_path: Path) -> None:
     families = {each.model: each for each in (InvtCHE, InnovertIBD, DelixiModbus)}
     found = [
         Found(4, USUAL, Framing.RTU, (), 0.005),
@@ -285,7 +285,7 @@ def test_an_interrupted_scan_gives_no_advice(run: Run, port: str, monkeypatch: p
     assert re.fullmatch(r"no drives found in \d+ s\n", out)
 
 
-def test_quick_skips_the_second_pass_of_a_scan(run: Run, port: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_quick_scan_has_no_second_pass(run: Run, port: str, monkeypatch: pytest.MonkeyPatch) -> None:
     planned: list[list[Sweep]] = []
 
     def noted(_: object, sweeps: Sequence[Sweep], *__: object) -> Iterator[Finding]:
@@ -303,7 +303,7 @@ def test_quick_skips_the_second_pass_of_a_scan(run: Run, port: str, monkeypatch:
 
 
 @pytest.mark.long
-def test_on_a_terminal_scan_progress_is_one_line(port: str) -> None:
+def test_the_scan_progress_is_one_line_on_a_terminal(port: str) -> None:
     with on_terminal("scan", port, *PATIENTLY, *TWO_MODELS) as terminal:
         terminal.wait_for("address 2; ")
         terminal.wait_for("3 drives found in ")
@@ -426,7 +426,7 @@ poll = ["output_current"]
 
 
 @pytest.mark.long
-def test_simulate_serves_a_line_of_a_plant_over_modbus_tcp(tmp_path: Path, run: Run) -> None:
+def test_the_simulate_command_serves_a_line_of_a_plant_over_modbus_tcp(tmp_path: Path, run: Run) -> None:
     plant = tmp_path / "plant.toml"
     plant.write_text(PLANT.format(port="tcp://10.0.0.7"))
     with running("simulate", plant, "--ports", tmp_path / "ports", "--unpaced") as (_, said):
@@ -439,7 +439,7 @@ def test_simulate_serves_a_line_of_a_plant_over_modbus_tcp(tmp_path: Path, run: 
 
 
 @pytest.mark.long
-def test_simulate_serves_a_local_port_under_its_name_in_the_plant_file(tmp_path: Path, run: Run) -> None:
+def test_the_simulate_command_serves_a_local_port_under_its_own_name(tmp_path: Path, run: Run) -> None:
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = f"tcp://127.0.0.1:{free.getsockname()[1]}"
     plant = tmp_path / "plant.toml"
@@ -449,7 +449,7 @@ def test_simulate_serves_a_local_port_under_its_name_in_the_plant_file(tmp_path:
         assert "output_current" in run("read", plant, "pump", "output_current")[1]
 
 
-def test_simulating_a_serial_line_needs_a_directory_for_its_port(tmp_path: Path, run: Run) -> None:
+def test_a_simulated_serial_line_needs_a_directory_for_its_port(tmp_path: Path, run: Run) -> None:
     plant = tmp_path / "plant.toml"
     plant.write_text(PLANT.format(port="/dev/ttyUSB0"))
     assert run("simulate", plant)[::2] == (
@@ -459,7 +459,7 @@ def test_simulating_a_serial_line_needs_a_directory_for_its_port(tmp_path: Path,
 
 
 @pytest.mark.long
-def test_scan_finds_drives_behind_a_gateway_and_writes_their_plant_file(tmp_path: Path, run: Run) -> None:
+def test_the_scan_command_finds_drives_behind_a_gateway(tmp_path: Path, run: Run) -> None:
     sims = [simulated(drive) for drive in (InnovertIBD(1), InvtCHE(2), ErmanERG220(3))]
     out = tmp_path / "found.toml"
     with Simulator([Wire(sims, port="tcp://127.0.0.1:0", unpaced=True)]) as line:

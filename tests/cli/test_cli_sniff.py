@@ -101,7 +101,7 @@ def test_polled_values_can_be_sniffed_and_decoded(line: tuple[str, str], tmp_pat
     assert {exchange["line"] for exchange in sniffer.exchanges} == {"hall-1"}
 
 
-def test_the_listener_of_sniff_cannot_send(line: tuple[str, str]) -> None:
+def test_the_listener_of_the_sniff_command_cannot_send(line: tuple[str, str]) -> None:
     with (
         closing(Listener(line[1], Settings(9600, "8N1"))) as listener,
         pytest.raises(OSError, match="Bad file"),
@@ -111,7 +111,7 @@ def test_the_listener_of_sniff_cannot_send(line: tuple[str, str]) -> None:
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_sniff_prints_an_unanswered_request_while_the_line_is_silent() -> None:
+def test_the_sniff_command_prints_an_unanswered_request_while_the_line_is_silent() -> None:
     master, slave = pty.openpty()
     with sniffing(os.ttyname(slave)) as sniffer:
         os.write(master, READ.request_frame)
@@ -369,7 +369,7 @@ def test_the_decode_command_prints_the_numbers_of_rows_and_exchanges(run: Run, c
     assert [row.value for row in recorded(out)] == [5000, 5000]
 
 
-def test_sniff_reports_a_port_that_cannot_be_opened(run: Run, tmp_path: Path) -> None:
+def test_the_sniff_command_reports_a_port_that_cannot_be_opened(run: Run, tmp_path: Path) -> None:
     ordinary = tmp_path / "file"
     ordinary.write_text("hello")
     for port, sentence in (
@@ -383,7 +383,7 @@ def test_sniff_reports_a_port_that_cannot_be_opened(run: Run, tmp_path: Path) ->
     assert run("sniff", port) == (2, "", f"multidrop: {port}: {sentence}\n")
 
 
-def test_sniff_reports_a_port_in_use(run: Run) -> None:
+def test_the_sniff_command_reports_a_port_in_use(run: Run) -> None:
     master, slave = pty.openpty()
     fcntl.flock(slave, fcntl.LOCK_EX)
     port = os.ttyname(slave)
@@ -392,7 +392,7 @@ def test_sniff_reports_a_port_in_use(run: Run) -> None:
     os.close(slave)
 
 
-def test_sniff_reports_a_missing_permission(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_sniff_command_reports_a_missing_permission(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """Root has every permission, so the system's refusal is simulated."""
 
     def refuse(path: str, flags: int) -> int:

@@ -47,12 +47,12 @@ def examined(run: Run, *words: object) -> tuple[int, str]:
     return status, " ".join(out.split())
 
 
-def test_doctor_measures_how_late_the_computer_wakes(run: Run, port: str) -> None:
+def test_the_doctor_command_measures_how_late_the_computer_wakes(run: Run, port: str) -> None:
     told = examined(run, port)[1]
     assert re.search(r"wake-ups the core wakes \d+\.\d\d ms late \(p50\), .* for 9600 8N1: p99 must be", told)
 
 
-def test_on_a_pty_doctor_reports_no_adapter(run: Run, port: str) -> None:
+def test_the_doctor_command_reports_no_adapter_on_a_pty(run: Run, port: str) -> None:
     status, out, err = run("doctor", port)
     assert (status, err) == (0, "")
     told = " ".join(out.split())
@@ -66,14 +66,14 @@ def test_on_a_pty_doctor_reports_no_adapter(run: Run, port: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("port", ["socket://127.0.0.1:0"], indirect=True)
-def test_doctor_says_that_the_adapter_of_a_socket_is_at_the_far_end(run: Run, port: str) -> None:
+def test_the_doctor_command_says_that_the_adapter_of_a_socket_is_far_away(run: Run, port: str) -> None:
     status, told = examined(run, port)
     assert status == 0
     assert "is a TCP connection" in told
     assert "at the far end" in told
 
 
-def test_rs485_modes_are_accepted_only_for_devices(run: Run, port: str) -> None:
+def test_an_rs485_mode_is_accepted_only_for_a_device(run: Run, port: str) -> None:
     status, out, err = run("doctor", port, "--rs485", "rts-up")
     assert (status, err) == (0, "")  # a pseudo-terminal has no RS-485 mode, and needs none
     for words, sentence in (
@@ -88,7 +88,7 @@ def test_rs485_modes_are_accepted_only_for_devices(run: Run, port: str) -> None:
 @pytest.mark.slow
 @pyserials_own
 @pytest.mark.parametrize("port", ["socket://127.0.0.1:0"], indirect=True)
-def test_doctor_says_that_the_adapter_of_a_pyserial_port_is_at_the_far_end(run: Run, port: str) -> None:
+def test_the_doctor_command_says_that_the_adapter_of_a_pyserial_port_is_far_away(run: Run, port: str) -> None:
     server = SerialServer(port)
     status, out, _ = run("doctor", server.url)
     server.close()
@@ -98,7 +98,7 @@ def test_doctor_says_that_the_adapter_of_a_pyserial_port_is_at_the_far_end(run: 
     assert "at the far end" in told
 
 
-def test_doctor_reports_a_port_lost_during_the_echo_test(run: Run) -> None:
+def test_the_doctor_command_reports_a_port_lost_during_the_echo_test(run: Run) -> None:
     port, hang_up = vanishing_pty()
     thread = threading.Thread(target=hang_up)
     thread.start()
@@ -109,7 +109,7 @@ def test_doctor_reports_a_port_lost_during_the_echo_test(run: Run) -> None:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_patient")
-def test_doctor_measures_the_round_trip_with_a_drive(run: Run, port: str) -> None:
+def test_the_doctor_command_measures_the_round_trip_with_a_drive(run: Run, port: str) -> None:
     words = ("--model", "innovert-ibd", "--address", "2", "--framing", "ascii", "--json")
     status, out, _ = run("doctor", port, *words)
     assert status == 0
@@ -119,7 +119,7 @@ def test_doctor_measures_the_round_trip_with_a_drive(run: Run, port: str) -> Non
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_patient")
-def test_doctor_measures_all_drives_of_a_plant(run: Run, port: str, tmp_path: Path) -> None:
+def test_the_doctor_command_measures_all_drives_of_a_plant(run: Run, port: str, tmp_path: Path) -> None:
     plant = tmp_path / "plant.toml"
     drive = '[[line.drive]]\nname = "{}"\nmodel = "{}"\naddress = {}\n'
     plant.write_text(
@@ -141,7 +141,7 @@ def test_doctor_measures_all_drives_of_a_plant(run: Run, port: str, tmp_path: Pa
 
 
 @pytest.mark.slow
-def test_doctor_sends_only_five_requests_to_a_silent_drive(run: Run, port: str) -> None:
+def test_the_doctor_command_sends_only_five_requests_to_a_silent_drive(run: Run, port: str) -> None:
     status, told = examined(run, port, *CHE_9)
     assert status == 1
     assert "did not answer 5 requests" in told
@@ -237,7 +237,7 @@ def test_the_echo_test_ignores_exceptions(run: Run, responder: Any, monkeypatch:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("code", [0x0A, 0x0B])
-def test_a_gateways_exception_is_not_the_drives_answer(run: Run, responder: Any, code: int) -> None:
+def test_an_exception_from_a_gateway_is_not_the_drives_reply(run: Run, responder: Any, code: int) -> None:
     """These codes mean that the device was not reached (application protocol V1.1b3, section 7)."""
     end = responder(lambda request: build_reply(Framing.RTU, Message(request[0], request[1], exception=code)))
     status, told = examined(run, end.path, *CHE_9)
@@ -269,7 +269,9 @@ def test_an_exception_reply_shows_the_framing_of_a_gateway(run: Run, monkeypatch
 
 
 @pytest.mark.slow
-def test_doctor_prints_the_exception_code_of_a_drive_that_refuses(run: Run, responder: Any) -> None:
+def test_the_doctor_command_prints_the_exception_code_of_a_drive_that_refuses(
+    run: Run, responder: Any
+) -> None:
     end = responder(lambda request: build_reply(Framing.RTU, Message(request[0], request[1], exception=6)))
     status, told = examined(run, end.path, *CHE_9)
     assert (status, "invt-che@9 answers in" in told) == (0, True)
@@ -277,7 +279,9 @@ def test_doctor_prints_the_exception_code_of_a_drive_that_refuses(run: Run, resp
 
 
 @pytest.mark.slow
-def test_doctor_counts_only_sent_requests(run: Run, responder: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_doctor_command_counts_only_sent_requests(
+    run: Run, responder: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A silent drive gets no request while its late reply may come. Held-back requests are not counted."""
     end = responder(lambda request: b"")
     monkeypatch.setattr("multidrop.cli.doctor.MOST_S", 1.0)
@@ -300,7 +304,9 @@ def test_doctor_counts_only_sent_requests(run: Run, responder: Any, monkeypatch:
         (("/dev/nowhere", "--framing", "rtu"), 2, "--framing needs a drive: add --model and --address"),
     ],
 )
-def test_mistaken_arguments_are_named(run: Run, words: tuple[str, ...], status: int, sentence: str) -> None:
+def test_wrong_arguments_are_named_in_the_error(
+    run: Run, words: tuple[str, ...], status: int, sentence: str
+) -> None:
     found, out, err = run("doctor", *words)
     assert (found, out) == (status, "")
     assert sentence in err
@@ -326,7 +332,9 @@ def test_a_drive_on_modbus_tcp_is_measured(port: str, run: Run) -> None:
     ),
     indirect=["port"],
 )
-def test_doctor_reports_the_other_framing(port: str, asked: str, spoken: str, other: str, run: Run) -> None:
+def test_the_doctor_command_reports_the_other_framing(
+    port: str, asked: str, spoken: str, other: str, run: Run
+) -> None:
     place = port.partition("://")[2]
     status, told = examined(run, f"{asked}://{place}", *CHE_1)
     assert status == 1

@@ -85,7 +85,7 @@ def test_an_adapter_without_known_facts_has_only_a_name(sysfs: Path) -> None:
     assert find_adapter("/dev/ttyS7", sysfs) == Adapter("ttyS7")
 
 
-def test_rs485_modes_are_decoded_from_linuxs_struct() -> None:
+def test_the_rs485_mode_is_decoded_from_the_struct_of_linux() -> None:
     # struct serial_rs485 in linux/serial.h: flags, two delays in ms, five words of padding
     assert decoded_rs485(struct.pack("=8I", 0x01, 0, 0, 0, 0, 0, 0, 0)) == RS485Mode(True, False)
     assert decoded_rs485(struct.pack("=8I", 0x13, 5, 5, 0, 0, 0, 0, 0)) == RS485Mode(True, True)
@@ -122,7 +122,7 @@ def test_a_driver_that_refuses_the_rs485_mode_counts_as_having_none(
     assert written == [bytes(32)] * settable
 
 
-def test_reading_driver_features_of_a_lost_port_raises_an_error() -> None:
+def test_a_lost_port_raises_an_error_when_its_driver_is_examined() -> None:
     master, slave = os.openpty()
     os.close(master)
     os.close(slave)
@@ -139,7 +139,7 @@ def test_low_latency_is_not_advised_for_drivers_that_ignore_it(driver: str) -> N
     assert low_latency_finding(False, "ftdi_sio").advice
 
 
-def test_doctor_gives_advice_if_the_latency_timer_is_long(sysfs: Path) -> None:
+def test_the_doctor_command_gives_advice_if_the_latency_timer_is_long(sysfs: Path) -> None:
     finding = latency_finding(find_adapter("/dev/ttyUSB0", sysfs))
     assert finding.what == "16 ms: every reply may wait that long in the adapter"
     assert f"echo 1 | sudo tee {sysfs}/bus/usb-serial/devices/ttyUSB0/latency_timer" in finding.advice
@@ -222,7 +222,7 @@ def test_each_finding_is_a_sentence_with_advice_if_needed(finding: object, what:
     assert bool(finding.advice) == advised
 
 
-def test_doctor_gives_advice_if_the_round_trip_is_slow() -> None:
+def test_the_doctor_command_gives_advice_if_the_round_trip_is_slow() -> None:
     drive = InvtCHE(1)
     usual = round_trip_finding(drive, [0.005] * ROUNDS, ROUNDS)
     assert usual.what.endswith("answers in 5.0 ms (median; 5.0 to 5.0 ms)")
@@ -234,7 +234,7 @@ def test_doctor_gives_advice_if_the_round_trip_is_slow() -> None:
     assert "did not answer 4 requests" in round_trip_finding(drive, [], 4).what
 
 
-def test_doctor_reports_lost_requests_as_a_failure_with_advice() -> None:
+def test_the_doctor_command_reports_lost_requests_as_a_failure_with_advice() -> None:
     lost = round_trip_finding(InvtCHE(1), [0.005] * 10, 17)
     assert lost.what.endswith("7 of 17 requests got no valid reply")
     assert lost.advice.startswith("check termination, bias, cable and signal ground")

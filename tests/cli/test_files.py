@@ -90,7 +90,7 @@ def fill(pipe: int) -> None:
     os.set_blocking(pipe, True)
 
 
-def test_log_lines_lost_because_of_a_slow_reader_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_log_line_lost_because_of_a_slow_reader_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(log_thread, "MOST_WAITING", 3)
     unread, log = os.pipe()
     with os.fdopen(unread) as reader, os.fdopen(log, "w") as stream:
@@ -107,7 +107,7 @@ def test_log_lines_lost_because_of_a_slow_reader_are_counted(monkeypatch: pytest
     assert told == ["first", lost, "line 0", "line 1", "line 2"]
 
 
-def test_closing_a_log_writes_all_lines_and_ignores_a_closed_reader() -> None:
+def test_a_closed_log_has_written_all_its_lines() -> None:
     unread, log = os.pipe()
     with os.fdopen(log, "w") as stream:
         handler = LogThread(stream, FORMAT)
@@ -140,7 +140,7 @@ def test_a_fleets_gateway_never_waits_for_its_log(monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.parametrize("command", ["serve", "hub"])
-def test_logs_of_a_fleet_have_time_and_level_in_text_and_json(
+def test_the_log_of_a_fleet_has_time_and_level_in_text_and_json(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], tmp_path: Path, command: str
 ) -> None:
     require_module("nats")
@@ -162,7 +162,7 @@ def test_logs_of_a_fleet_have_time_and_level_in_text_and_json(
     assert datetime.fromisoformat(found["time"]).tzinfo is not None
 
 
-def test_closing_a_log_whose_thread_never_started_raises_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_log_can_be_closed_if_its_thread_never_started(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ctrl-C came before the thread was started. `logging` closes the handler at exit."""
     monkeypatch.setattr(threading.Thread, "start", lambda thread: None)
     LogThread(io.StringIO(), FORMAT).close()

@@ -230,7 +230,7 @@ def test_an_old_value_is_marked_although_the_clock_is_set_back(watched: LivePlan
     assert (first.age(slept), first.is_old("output_frequency", slept)) == (3600.5, True)
 
 
-def test_reads_of_unpolled_registers_take_at_most_5_percent_of_a_lines_time(tmp_path: Path) -> None:
+def test_unpolled_registers_are_read_in_at_most_5_percent_of_the_time(tmp_path: Path) -> None:
     for utilisation, share in ((0.2, 0.05), (0.97, 0.03), (1.0, 0.01), (3.0, 0.01)):
         assert 0.03 / (0.03 + pause_s(0.03, utilisation)) == pytest.approx(share)
     assert pause_s(0.001, 0.2) == 0.1  # a fast read is followed by the minimum pause
@@ -242,7 +242,9 @@ def test_reads_of_unpolled_registers_take_at_most_5_percent_of_a_lines_time(tmp_
 @pytest.mark.long
 @table("size", [(60, 12), (80, 24), (200, 50), (500, 100)])
 @table("drives", [1, 31, 247])
-def test_monitor_pictures_fit_every_terminal_size(tmp_path: Path, size: tuple[int, int], drives: int) -> None:
+def test_the_pictures_of_the_monitor_fit_every_terminal_size(
+    tmp_path: Path, size: tuple[int, int], drives: int
+) -> None:
     live = LivePlant(a_plant(tmp_path, min(drives, 247)))
     live.add(from_rows([row("drive-1", register, 4.0) for register in CHE]))
     live.tick(1.0, told(1, 1, 1.0, drives))
@@ -537,7 +539,9 @@ def test_a_failed_stop_is_not_shown_as_repeated(screened: Screened, monkeypatch:
     assert monitor._at.message == "stopping drive-1 failed"
 
 
-def test_quitting_waits_for_a_running_stop(screened: Screened, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_monitor_ends_only_after_a_running_stop(
+    screened: Screened, capsys: pytest.CaptureFixture[str]
+) -> None:
     monitor = screened.monitor
     stands = threading.Event()
     del monitor._begin  # restores the real method, which starts a thread
@@ -702,7 +706,7 @@ def test_the_monitor_is_complete_without_colours_and_utf_8(plant: Path) -> None:
 
 
 @pytest.mark.long
-def test_on_a_dumb_terminal_the_monitor_scrolls(plant: Path) -> None:
+def test_the_monitor_scrolls_on_a_dumb_terminal(plant: Path) -> None:
     with on_terminal("monitor", plant, TERM="dumb") as terminal:
         terminal.wait_for(">pump-1")
         terminal.wait_for("q quit")
@@ -720,7 +724,7 @@ def test_the_monitor_refuses_a_terminal_that_is_too_small(plant: Path) -> None:
         assert terminal.process.wait(timeout=60) == 2
 
 
-def test_without_a_terminal_the_monitor_suggests_other_commands(run: Run, tmp_path: Path) -> None:
+def test_the_monitor_suggests_other_commands_without_a_terminal(run: Run, tmp_path: Path) -> None:
     status, _, err = run("monitor", plant_file(tmp_path))
     assert status == 2
     assert err.startswith("multidrop: `multidrop monitor` needs a terminal on Linux or macOS; ")

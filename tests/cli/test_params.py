@@ -60,7 +60,9 @@ def test_saved_parameters_can_be_applied_again(run: Run, drive: tuple[object, ..
     assert "has these parameters already" in run("params", "apply", "pump.toml", *drive, "--yes")[1]
 
 
-def test_apply_writes_only_after_confirmation(run: Run, drive: tuple[object, ...], sim: MotorDrive) -> None:
+def test_the_apply_action_writes_only_after_confirmation(
+    run: Run, drive: tuple[object, ...], sim: MotorDrive
+) -> None:
     run("params", "save", *drive, "pump.toml")
     sim["acceleration_time"] = 25.0
     status, _, err = run("params", "apply", "pump.toml", *drive)
@@ -109,7 +111,9 @@ def test_commissioning_needs_a_terminal(run: Run, drive: tuple[object, ...], sim
     assert json.loads(Path("audit.jsonl").read_text())["commissioning"] is True
 
 
-def test_apply_never_writes_to_running_motors(run: Run, drive: tuple[object, ...], sim: MotorDrive) -> None:
+def test_the_apply_action_never_writes_to_running_motors(
+    run: Run, drive: tuple[object, ...], sim: MotorDrive
+) -> None:
     run("params", "save", *drive, "pump.toml")
     sim["acceleration_time"] = 25.0
     sim.motor.target = 40.0
@@ -120,7 +124,9 @@ def test_apply_never_writes_to_running_motors(run: Run, drive: tuple[object, ...
     assert sim["acceleration_time"] == 25.0
 
 
-def test_params_actions_print_json(run: Run, drive: tuple[object, ...], sim: MotorDrive) -> None:
+def test_the_actions_of_the_params_command_print_json(
+    run: Run, drive: tuple[object, ...], sim: MotorDrive
+) -> None:
     saved = json.loads(run("params", "save", *drive, "pump.csv", "--json")[1])
     assert saved["parameters"]["b.003"] == 100
     sim["acceleration_time"] = 25.0
@@ -134,7 +140,7 @@ def test_params_actions_print_json(run: Run, drive: tuple[object, ...], sim: Mot
     assert {row["code"]: row["raw"] for row in listed}["b.003"] == 100
 
 
-def test_params_compares_two_files_and_two_drives(run: Run, drive: tuple[object, ...]) -> None:
+def test_the_params_command_compares_two_files_and_two_drives(run: Run, drive: tuple[object, ...]) -> None:
     run("params", "save", *drive, "a.toml")
     run("params", "save", *drive, "b.csv")
     assert run("params", "diff", "a.toml", "b.csv")[0] == 0

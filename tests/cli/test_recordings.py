@@ -26,7 +26,7 @@ def ramp(tmp_path: Path) -> Path:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_unpainted")
-def test_plot_and_report_need_only_the_recording(run: Run, ramp: Path, tmp_path: Path) -> None:
+def test_the_commands_plot_and_report_need_only_the_recording(run: Run, ramp: Path, tmp_path: Path) -> None:
     here = tmp_path / "ramp.arrows"
     here.write_bytes(ramp.read_bytes())
     assert run("plot", here) == (0, f"{tmp_path}/ramp.png\n", "")
@@ -49,7 +49,7 @@ def test_plot_and_report_need_only_the_recording(run: Run, ramp: Path, tmp_path:
         (("--out", "picture.jpg"), "picture.jpg: a plot's name must end in .png or .html"),
     ],
 )
-def test_mistaken_plot_options_are_reported_in_one_sentence(
+def test_wrong_plot_options_are_reported_in_one_sentence(
     run: Run, ramp: Path, tmp_path: Path, words: tuple[str, ...], sentence: str
 ) -> None:
     out = () if "--out" in words else ("--out", tmp_path / "it.png")
@@ -103,7 +103,7 @@ def test_a_file_without_a_recording_prints_one_sentence(run: Run, tmp_path: Path
 
 
 @pytest.mark.parametrize("time", [-(2**63), -1, 2**63 - 1])
-def test_times_outside_the_calendar_print_one_sentence(run: Run, tmp_path: Path, time: int) -> None:
+def test_a_time_outside_the_calendar_prints_one_sentence(run: Run, tmp_path: Path, time: int) -> None:
     rows = [
         row(0, "pump", "output_frequency", 1.0),
         row(1, "pump", "output_frequency", 1.0)._replace(time_ns=time),

@@ -236,17 +236,17 @@ def invalid_plants() -> list[str]:
 
 
 @pytest.mark.long
-def test_schema_accepts_the_valid_plant_files() -> None:
+def test_the_schema_accepts_the_valid_plant_files() -> None:
     valid = valid_plants()
     assert len(valid) > 20
     assert [text for text in valid if not accepts("plant", text)] == []
 
 
-def test_schema_refuses_the_invalid_plant_files() -> None:
+def test_the_schema_refuses_the_invalid_plant_files() -> None:
     check_refusals("plant", invalid_plants())
 
 
-def test_schema_refuses_mistakes_in_the_serve_table(tmp_path: Path) -> None:
+def test_the_schema_refuses_mistakes_in_the_serve_table(tmp_path: Path) -> None:
     lines = BAD_SERVE.splitlines()
     for line in lines:
         with pytest.raises(PlantError):
@@ -255,7 +255,7 @@ def test_schema_refuses_mistakes_in_the_serve_table(tmp_path: Path) -> None:
     assert [line for line in lines if accepts("plant", f"{plant}[serve]\n{line}\n")] == []
 
 
-def test_schema_refuses_mistakes_in_the_fleet_table() -> None:
+def test_the_schema_refuses_mistakes_in_the_fleet_table() -> None:
     plant = PLANTS.HEAD + PLANTS.TOY
     assert accepts("plant", f'{plant}[fleet]\nmay.write = ["pump-*.setpoint"]\n')
     assert [line for line in BAD_FLEET.splitlines() if accepts("plant", f"{plant}[fleet]\n{line}\n")] == []
@@ -352,21 +352,21 @@ def valid_families() -> list[str]:
 
 
 @pytest.mark.long
-def test_schema_accepts_the_valid_family_files() -> None:
+def test_the_schema_accepts_the_valid_family_files() -> None:
     valid = valid_families()
     assert len(valid) > 20
     assert [text for text in valid if not accepts("family", text)] == []
 
 
-def test_loader_refuses_the_family_files_that_break_one_rule() -> None:
+def test_the_loader_refuses_the_family_files_that_break_one_rule() -> None:
     assert [text for text in bad_families() if not mistakes("family", text)] == []
 
 
-def test_schema_refuses_the_invalid_family_files() -> None:
+def test_the_schema_refuses_the_invalid_family_files() -> None:
     check_refusals("family", invalid_families())
 
 
-def test_schema_refuses_two_names_with_one_number() -> None:
+def test_the_schema_refuses_two_names_with_one_number() -> None:
     def register(names: str) -> str:
         return f"{FAMILIES.HEAD}[reading]\na = {{ at = 1, {names} }}\n"
 
@@ -405,7 +405,7 @@ def test_schema_refuses_two_names_with_one_number() -> None:
         ("[[identify]]\nregister = 'device'\nis = [1]\n[[identify]]\nregister = 'dveice'\nis = [1]", False),
     ],
 )
-def test_schema_refuses_many_misspelt_names_of_registers(referring: str, is_accepted: bool) -> None:
+def test_the_schema_refuses_many_misspelt_names_of_registers(referring: str, is_accepted: bool) -> None:
     names = "[reading]\ndevice = { at = 1 }\nlowest = { at = 2 }\npower_of_ten = { at = 3 }\n"
     option = '[option]\nhighest = { span = [0, 50], meaning = "m" }\n'
     text = f"{FAMILIES.HEAD}{option}{names}{referring.removeprefix(FIRST_SECTION)}\n"
@@ -447,7 +447,7 @@ def test_a_schema_for_given_csv_files_refuses_other_csv_files(tmp_path: Path) ->
         ('value = "integral(output_power)"\nunit = "kW*h"', True),
     ],
 )
-def test_schema_checks_registers_and_integrals_of_channels(channel: str, is_accepted: bool) -> None:
+def test_the_schema_checks_registers_and_integrals_of_channels(channel: str, is_accepted: bool) -> None:
     first = '[[line.drive.channel]]\nname = "energy"\nvalue = "integral(output_power)"\nunit = "kWh"\n'
     assert first in PLANTS.FILE
     text = PLANTS.FILE.replace(first, f'[[line.drive.channel]]\nname = "energy"\n{channel}\n')

@@ -79,7 +79,7 @@ def test_a_signal_while_the_event_loop_is_made_leaves_no_traceback(
     gc.collect()
 
 
-def test_under_nohup_sighup_is_ignored() -> None:
+def test_sighup_is_ignored_under_nohup() -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         with end_signals_interrupt(), noting_signals() as interruption:
@@ -125,7 +125,9 @@ def test_a_second_signal_interrupts_immediately() -> None:
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_poll_keeps_its_recording_when_its_terminal_is_closed(plant: Path, tmp_path: Path) -> None:
+def test_the_poll_command_keeps_its_recording_when_its_terminal_is_closed(
+    plant: Path, tmp_path: Path
+) -> None:
     require_module("pyarrow")
     out = tmp_path / "out.parquet"  # a Parquet file cannot be read unless it was closed
     with closing_terminal("poll", plant, "--out", out) as terminal:
@@ -136,7 +138,7 @@ def test_poll_keeps_its_recording_when_its_terminal_is_closed(plant: Path, tmp_p
 
 
 @pytest.mark.long
-def test_simulate_removes_its_links_when_its_terminal_is_closed(tmp_path: Path) -> None:
+def test_the_simulate_command_removes_its_links_when_its_terminal_is_closed(tmp_path: Path) -> None:
     link = tmp_path / "ports" / "hall-1"
     words = ["simulate", plant_file(tmp_path), "--ports", tmp_path / "ports"]
     with closing_terminal(*words) as terminal:

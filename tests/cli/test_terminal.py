@@ -133,7 +133,7 @@ def test_a_closed_terminal_is_not_read_in_a_loop(monkeypatch: pytest.MonkeyPatch
 
 @pytest.mark.slow
 @pytest.mark.long
-def test_on_a_terminal_a_demo_shows_the_monitor_until_its_time_has_passed(tmp_path: Path) -> None:
+def test_a_demo_shows_the_monitor_on_a_terminal(tmp_path: Path) -> None:
     out = tmp_path / "demo.arrows"
     with on_terminal("demo", "--out", out, "--seconds", 2, size=(120, 24)) as terminal:
         terminal.wait_for(">pump-1")
@@ -146,7 +146,7 @@ def test_on_a_terminal_a_demo_shows_the_monitor_until_its_time_has_passed(tmp_pa
 
 
 @pytest.mark.long
-def test_on_a_terminal_poll_shows_the_newest_values_in_a_table(plant: Path) -> None:
+def test_the_poll_command_shows_the_newest_values_on_a_terminal(plant: Path) -> None:
     with on_terminal("poll", plant, "--seconds", "1", size=(120, 24)) as terminal:
         terminal.wait_for("DRIVE   SAMPLES  MISSES  NEWEST VALUES")
         terminal.wait_for("output_current 0.00 A, mystery 0 raw, fault NONE, status none")
@@ -195,7 +195,7 @@ def test_key_m_without_a_recording_says_that_the_comment_would_be_lost() -> None
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_terminal_shows_the_signal_around_the_last_trigger(plant: Path, tmp_path: Path) -> None:
+def test_the_terminal_shows_the_signal_around_the_last_trigger(plant: Path, tmp_path: Path) -> None:
     condition = "integral(pump-1.output_current >= 0) > 0.3"
     options = ("--trigger", condition, "--pre", "100 ms", "--post", "200 ms", "--out", tmp_path / "a.arrows")
     with on_terminal("poll", plant, *options, size=(100, 24)) as terminal:

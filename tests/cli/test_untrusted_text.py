@@ -134,7 +134,7 @@ def test_the_log_of_a_gateway_contains_no_password_of_a_url(
 
 
 @table("trap", TRAPS)
-def test_names_and_ports_that_cannot_be_printed_are_refused(tmp_path: Path, trap: str) -> None:
+def test_a_name_or_port_that_cannot_be_printed_is_refused(tmp_path: Path, trap: str) -> None:
     text = "".join(f"\\u{ord(character):04x}" for character in trap)
     path = tmp_path / "plant.toml"
     path.write_text(
@@ -184,7 +184,7 @@ def test_arguments_are_printed_without_control_characters(run: Run, words: tuple
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_unpainted")
-def test_names_in_a_recording_are_printed_without_control_characters(run: Run, tmp_path: Path) -> None:
+def test_the_names_in_a_recording_are_printed_without_control_characters(run: Run, tmp_path: Path) -> None:
     rows = [row(at, TRAP, f"{TRAP}{number}", at) for at in range(3) for number in range(4)]
     rows.append(row(3, TRAP, TRAP, None, TRAP))
     drive = dict.fromkeys(("line", "model", "settings", "address", "framing"), TRAP)
@@ -208,7 +208,7 @@ def test_names_in_a_recording_are_printed_without_control_characters(run: Run, t
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Glyph")
 @pytest.mark.usefixtures("_laid_out")
-def test_names_with_markup_are_plain_text_in_pictures_and_legends(tmp_path: Path) -> None:
+def test_a_name_with_markup_is_plain_text_in_pictures_and_legends(tmp_path: Path) -> None:
     require_module("matplotlib")
     from multidrop.report import load, plot, plot_page, report_page
 
@@ -254,7 +254,7 @@ def section_length(path: Path) -> int:
 
 
 @pytest.mark.slow
-def test_commands_print_through_the_escaping_function() -> None:
+def test_every_command_prints_through_the_escaping_function() -> None:
     """Commands call `print` only for help, drawings, schemas and questions. All other text is escaped."""
     printing = ("__init__", "support/output", "params", "poll", "scan", "schema")
     ours = {f"{name}.py" for name in printing}
@@ -270,7 +270,7 @@ def test_commands_print_through_the_escaping_function() -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("command", usually("poll", "plan"))
-def test_running_a_users_model_file_is_reported_once(tmp_path: Path, command: str) -> None:
+def test_a_users_model_file_that_is_run_is_reported_once(tmp_path: Path, command: str) -> None:
     """The command runs in a new process, because each process reports this only once."""
     (tmp_path / "fan.py").write_text(
         "from pathlib import Path\nfrom multidrop import Drive, reading\n"

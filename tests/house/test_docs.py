@@ -286,7 +286,7 @@ def test_the_code_blocks_of_a_page_run_as_printed(page: Path, session: Session) 
             raise AssertionError(f"{named(page)}, line {block.line}: {failure}") from failure
 
 
-def test_code_blocks_name_a_known_language() -> None:
+def test_every_code_block_names_a_known_language() -> None:
     found = {(named(page), block.line, block.language) for page in PAGES for block in blocks(page)}
     assert [each for each in found if each[2] not in LANGUAGES] == []
 
@@ -337,7 +337,7 @@ def test_commands_in_the_docs_are_accepted_by_the_argument_parser(
         assert main(words) == 0
 
 
-def test_links_on_the_pages_have_existing_targets() -> None:
+def test_every_link_on_a_page_has_an_existing_target() -> None:
     for page in PAGES:
         for target in re.findall(r"\]\(([^)#]+?)(?:#[^)]*)?\)", prose(page)):
             is_there = target.startswith("https://") or (page.parent / target).exists()
@@ -385,7 +385,7 @@ def test_every_public_name_is_in_the_reference(package: str, monkeypatch: pytest
 
 
 @pytest.mark.parametrize("page", ["index.md", "reference/api.md"])
-def test_index_and_api_pages_are_plain_markdown(page: str) -> None:
+def test_the_index_and_api_pages_are_plain_markdown(page: str) -> None:
     """A code host shows directives and definition lists as raw text."""
     text = (DOCS / page).read_text("utf-8")
     assert re.findall(r"^```\{.*|^: .*|^:::.*", text, re.MULTILINE) == []
@@ -443,7 +443,7 @@ def test_every_extra_is_in_the_reference() -> None:
     assert given == set(extras) - {"bench", "docs", "test"}
 
 
-def test_speed_table_equals_readme() -> None:
+def test_the_speed_table_equals_that_of_the_readme() -> None:
     speed = (DOCS / "explanation" / "speed-table.md").read_text("utf-8")
     assert speed.strip() in (ROOT / "README.md").read_text("utf-8")
 

@@ -32,7 +32,7 @@ def run(*words: str) -> str:
     return subprocess.run([sys.executable, *words], capture_output=True, text=True, check=True).stdout
 
 
-def test_public_name_is_the_object_of_its_module() -> None:
+def test_a_public_name_is_the_object_of_its_module() -> None:
     for name in NAMES:
         home = import_module(multidrop._HOMES[name])
         assert getattr(multidrop, name) is getattr(home, name)
@@ -46,7 +46,7 @@ def test_no_public_name_is_listed_twice() -> None:
     assert len(set(NAMES)) == len(NAMES)
 
 
-def test_unknown_name_raises_attribute_error() -> None:
+def test_an_unknown_name_raises_attribute_error() -> None:
     with pytest.raises(AttributeError, match="module 'multidrop' has no attribute 'Buss'"):
         _ = multidrop.Buss  # type: ignore[attr-defined]
 
@@ -58,15 +58,15 @@ def test_modules_are_imported_when_their_names_are_first_used() -> None:
     assert run("-c", code).strip() == str(["multidrop"])
 
 
-def test_version_is_the_distribution_version() -> None:
+def test_the_version_is_that_of_the_distribution() -> None:
     assert multidrop.__version__ == version("multidrop")
 
 
-def test_package_runs_as_a_module() -> None:
+def test_the_package_runs_as_a_module() -> None:
     assert "usage: multidrop" in run("-m", "multidrop", "--help")
 
 
-def test_family_is_declared_with_public_names() -> None:
+def test_a_family_is_declared_with_public_names() -> None:
     """Declare a user's own family with public names only."""
 
     class Own(multidrop.Drive):
@@ -110,7 +110,7 @@ def test_dir_of_the_package_lists_only_its_few_public_names() -> None:
     assert dir(multidrop) == sorted(multidrop.__all__)
 
 
-def test_help_of_a_verb_has_its_signature() -> None:
+def test_the_help_of_a_verb_has_its_signature() -> None:
     shown = render_doc(multidrop.YD1000.start, renderer=plaintext)
     assert "start(self, direction: " in shown
     assert str(signature(Toy(1).stop)) == "()"
@@ -181,7 +181,7 @@ def mypy(folder: Path) -> str:
 
 
 @pytest.mark.long
-def test_scripts_that_use_public_names_pass_mypy_strict(tmp_path: Path) -> None:
+def test_a_script_that_uses_public_names_passes_mypy_strict(tmp_path: Path) -> None:
     pytest.importorskip("mypy")
     for name, script in SCRIPTS.items():
         (tmp_path / f"{name}.py").write_text(script, "utf-8")

@@ -39,7 +39,7 @@ SETTING_UP = [
 ]
 
 
-def test_readme_is_short() -> None:
+def test_the_readme_is_short() -> None:
     assert len(README.splitlines()) <= 120
 
 
@@ -69,7 +69,7 @@ def test_setup_commands_in_readme_equal_those_of_ci_run() -> None:
 
 
 @pytest.mark.slow
-def test_ten_line_example_runs(tmp_path: Path) -> None:
+def test_the_ten_line_example_runs(tmp_path: Path) -> None:
     """Run the lines in a fresh interpreter without a warning."""
     (block,) = re.findall(r"^```python\n(.*?)^```$", README, re.DOTALL | re.MULTILINE)
     (tmp_path / "ten_lines.py").write_text(block)
@@ -86,7 +86,7 @@ def test_ten_line_example_runs(tmp_path: Path) -> None:
     assert acceleration == "20.0 s"
 
 
-def test_readme_lists_every_family() -> None:
+def test_the_readme_lists_every_family() -> None:
     table = README.partition("## Families")[2].partition("\n## ")[0]
     assert re.findall(r"^\| `([^`]+)`", table, re.MULTILINE) == list(MODELS)
 
@@ -136,7 +136,7 @@ def test_test_bench_example_measures_and_records_each_step(tmp_path: Path) -> No
 
 
 @pytest.mark.slow
-def test_own_device_example_runs(tmp_path: Path) -> None:
+def test_the_own_device_example_runs(tmp_path: Path) -> None:
     printed = run(tmp_path, "own_device.py")
     assert "temperature  21.4 degC" in printed
     assert "FILTER" in printed
@@ -145,14 +145,14 @@ def test_own_device_example_runs(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_asyncio_example_runs(tmp_path: Path) -> None:
+def test_the_asyncio_example_runs(tmp_path: Path) -> None:
     lines = run(tmp_path, "asyncio_poll.py", "1").splitlines()
     assert "tick" in lines
     assert any(line.endswith(" rows") for line in lines)
 
 
 @pytest.mark.long
-def test_two_lines_example_polls_both_lines(tmp_path: Path) -> None:
+def test_the_example_with_two_lines_polls_both_lines(tmp_path: Path) -> None:
     printed = run(tmp_path, "two_lines.py", "4")
     for name in ("pump-1: ", "pump-2: ", "fan-1: ", "hall-1: ", "hall-2: "):
         assert name in printed

@@ -67,7 +67,7 @@ CI = "".join((ROOT / ".ci" / name).read_text("utf-8") for name in ("run", "night
 
 
 @pytest.mark.long
-def test_paths_in_ci_scripts_exist() -> None:
+def test_every_path_in_the_ci_scripts_exists() -> None:
     """After a rename, each pattern and each name in braces must still match a file."""
     code = re.sub(r"(?m)^ *#.*", "", CI)
     patterns = re.findall(r"(?<![\w/$])(?:bench|csrc|docs|tests)/[\w*.,{}/-]+", code)
@@ -86,7 +86,7 @@ def benchmarks() -> list[str]:
 
 
 @pytest.mark.long
-def test_test_names_in_ci_scripts_exist() -> None:
+def test_every_test_name_in_the_ci_scripts_exists() -> None:
     tests = {
         name
         for path in TESTS.glob("**/test_*.py")

@@ -163,13 +163,13 @@ def test_drive_families_import_only_from_the_drive_package() -> None:
 
 
 @pytest.mark.long
-def test_imports_come_only_from_lower_layers() -> None:
+def test_every_import_comes_from_a_lower_layer() -> None:
     found = {str(path.relative_to(PACKAGE)): upwards(path, run_time_imports(path)) for path in FILES}
     assert offenders(found) == {}
 
 
 @pytest.mark.long
-def test_type_imports_come_only_from_lower_layers() -> None:
+def test_every_type_import_comes_from_a_lower_layer() -> None:
     """This rule applies also to imports for annotations."""
     found = {str(path.relative_to(PACKAGE)): upwards(path, type_imports(path)) for path in FILES}
     assert offenders(found) == {}

@@ -290,7 +290,7 @@ def libmodbus(tmp_path_factory: pytest.TempPathFactory) -> Libmodbus:
 
 
 @pytest.mark.long
-def test_requests_are_decoded_as_by_a_libmodbus_server(libmodbus: Libmodbus) -> None:
+def test_every_request_is_decoded_as_by_a_libmodbus_server(libmodbus: Libmodbus) -> None:
     """Check that the server's replies and registers match our decoding of each request."""
     requests = frames(1, RTU, NUMBER, replies=False)
     differences = []
@@ -328,7 +328,7 @@ def name(framing: Framing) -> str:
 
 @pytest.mark.long
 @framings
-def test_requests_are_decoded_as_by_a_pymodbus_server(framing: Framing) -> None:
+def test_every_request_is_decoded_as_by_a_pymodbus_server(framing: Framing) -> None:
     pymodbus = Pymodbus(framing)
     differences = []
     for said in frames(3, framing, NUMBER, replies=False):
@@ -339,7 +339,7 @@ def test_requests_are_decoded_as_by_a_pymodbus_server(framing: Framing) -> None:
 
 @pytest.mark.long
 @framings
-def test_replies_are_decoded_as_by_a_pymodbus_client(framing: Framing) -> None:
+def test_every_reply_is_decoded_as_by_a_pymodbus_client(framing: Framing) -> None:
     pymodbus = Pymodbus(framing)
     differences = []
     for said in frames(4, framing, NUMBER, replies=True):
@@ -349,7 +349,7 @@ def test_replies_are_decoded_as_by_a_pymodbus_client(framing: Framing) -> None:
 
 @pytest.mark.slow
 @framings
-def test_replies_are_encoded_as_by_pymodbus(framing: Framing) -> None:
+def test_every_reply_is_encoded_as_by_pymodbus(framing: Framing) -> None:
     pymodbus = Pymodbus(framing)
     whole = [frame for frame in frames(5, framing, NUMBER, replies=True) if not frame.damage]
     for said in whole:

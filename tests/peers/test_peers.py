@@ -112,7 +112,7 @@ def test_registers_and_coils_of_other_servers_are_read(server: Server) -> None:
 
 @pytest.mark.slow
 @patient
-def test_read_raw_reads_undeclared_registers_of_pymodbus_and_libmodbus(server: Server) -> None:
+def test_undeclared_registers_of_pymodbus_and_libmodbus_can_be_read(server: Server) -> None:
     """Check that undeclared registers and coils have the values that the server's source defines."""
     with Bus(server.port) as bus:
         device = server.attach(bus)
@@ -150,7 +150,7 @@ def test_a_value_written_to_a_foreign_modbus_server_is_read_back(server: Server)
 
 @pytest.mark.slow
 @patient
-def test_exception_code_raises_drive_exception(server: Server) -> None:
+def test_an_exception_code_raises_drive_exception(server: Server) -> None:
     with Bus(server.port) as bus:
         device = server.attach(bus, family="Mistaken")
         with pytest.raises(DriveException, match="illegal address") as refusal:
@@ -171,7 +171,9 @@ def test_a_read_from_an_address_without_a_device_times_out(name: str, tmp_path: 
 
 @pytest.mark.slow
 @patient
-def test_commands_read_and_write_registers(server: Server, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_read_and_write_commands_work_with_other_servers(
+    server: Server, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["write", *server.words, "frequency", "31.4", "--yes"]) == 0
     assert main(["read", *server.words, "frequency", "current"]) == 0
     shown = capsys.readouterr().out
@@ -266,7 +268,7 @@ def plant_file(folder: Path, port: str, family: Path, *polled: str) -> Path:
 
 @pytest.mark.long
 @pytest.mark.parametrize("stated", [True, False], ids=["gaps stated", "nothing stated"])
-def test_poll_reads_all_40_values_of_the_server(tmp_path: Path, stated: bool) -> None:
+def test_the_poller_reads_all_40_values_of_the_server(tmp_path: Path, stated: bool) -> None:
     """The server rejects reads of undeclared registers."""
     assert len(METER_HOLDS) == 40
     family = family_file(tmp_path, stated=stated)
@@ -280,14 +282,14 @@ def test_poll_reads_all_40_values_of_the_server(tmp_path: Path, stated: bool) ->
 
 
 @pytest.mark.slow
-def test_read_many_reads_all_40_values_of_the_server(tmp_path: Path) -> None:
+def test_one_call_reads_all_40_values_of_the_server(tmp_path: Path) -> None:
     meter = load_family(FAMILY)
     with served(tmp_path) as port, Bus(port) as bus:
         assert bus.attach(meter, UNIT).read_many(meter.registers.values()) == METER_HOLDS
 
 
 @pytest.mark.parametrize(("stated", "requests"), [(True, 4), (False, 8)])
-def test_plan_of_39_floats_at_9600_baud_prints_the_documented_table(
+def test_the_plan_of_39_floats_prints_the_documented_table(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], stated: bool, requests: int
 ) -> None:
     """Check the plan in the documentation; 5 ms is the default response delay."""

@@ -78,7 +78,7 @@ def test_a_read_never_includes_forbidden_addresses() -> None:
     assert spans(Example(1), "far", "farther") == [(30, 1), (32, 1)]
 
 
-def test_read_plan_does_not_depend_on_order_or_repetition_of_registers() -> None:
+def test_a_read_plan_does_not_depend_on_order_or_repetition_of_registers() -> None:
     assert spans(Example(1), "c", "a", "b", "a") == [(1, 4)]
 
 
@@ -98,7 +98,7 @@ def test_planned_reads_and_writes_are_requests_of_the_modbus_standard() -> None:
         write_request(Example(7), Example.a, 1)
 
 
-def test_duration_of_a_read_includes_characters_silence_and_response_delay() -> None:
+def test_the_duration_of_a_read_includes_characters_silence_and_response_delay() -> None:
     drive = Example(1, baudrate=9600, format="8N1")
     (block,) = blocks(drive, [Example.a])
     characters = 8 + 7
@@ -257,7 +257,9 @@ def test_a_delay_suits_a_read_plan_if_it_suits_each_polling_rate() -> None:
 
 @table("framing", list(Framing))
 @table("table", [HOLDING, INPUT, COIL, DISCRETE])
-def test_predicted_number_of_characters_equals_that_of_built_frames(framing: Framing, table: Table) -> None:
+def test_the_predicted_number_of_characters_equals_that_of_built_frames(
+    framing: Framing, table: Table
+) -> None:
     drive = Example(1)
     drive.framing = framing
     for count in range(1, 126):
@@ -351,7 +353,7 @@ def test_drives_with_equal_line_settings_are_polled_in_a_row_if_switching_takes_
     assert silences(order, 0.05) < silences(drives, 0.05)
 
 
-def test_pause_between_two_drives_is_the_longer_silence_plus_the_switching_time() -> None:
+def test_the_pause_between_two_drives_is_the_longer_silence_plus_the_switching_time() -> None:
     slow, fast = MODELS["yd1000"](1), MODELS["erman-er-g-220"](2)
     longer = 24 * 11 / 9600 + 1 / 9600
     assert gap(slow, fast) == gap(fast, slow) == pytest.approx(longer)
@@ -359,7 +361,7 @@ def test_pause_between_two_drives_is_the_longer_silence_plus_the_switching_time(
     assert gap(fast, fast, switching=0.002) == pytest.approx(1.75e-3 + 1 / 38400)
 
 
-def test_planning_a_read_of_a_table_without_a_read_function_raises() -> None:
+def test_a_table_without_a_read_function_cannot_be_read() -> None:
     table = Table("command word", None, 0x06)
     with pytest.raises(ValueError, match=r"^a command word cannot be read$"):
         read_request(Example(1), table, 0, 1)
@@ -395,7 +397,7 @@ def test_a_read_may_include_a_declared_register_that_is_not_wanted() -> None:
     assert spans(drive, "a", "c") == [(1, 3)]
 
 
-def test_read_limit_of_one_table_does_not_apply_to_other_tables() -> None:
+def test_the_read_limit_of_one_table_does_not_apply_to_other_tables() -> None:
     registers = {f"h{at}": reading(at) for at in range(4)}
     registers |= {f"i{at}": reading(at, table=INPUT) for at in range(4)}
     drive = family(most_registers={HOLDING: 2}, **registers)(1)
@@ -424,7 +426,7 @@ REQUESTS = {
 
 
 @table("model", REQUESTS)
-def test_requests_that_read_the_built_in_families_are_unchanged(model: str) -> None:
+def test_the_requests_for_the_built_in_families_are_unchanged(model: str) -> None:
     drive = MODELS[model](3)
     found = [(block.request.function, block.start, block.count) for block in blocks(drive, drive.readings())]
     assert sorted(found) == REQUESTS[model]
@@ -465,7 +467,7 @@ def test_tables_that_are_read_by_the_same_function_share_requests() -> None:
     assert (HOLDING_MULTIPLE.read, HOLDING_MULTIPLE.write, HOLDING_MULTIPLE.name) == (3, 16, HOLDING.name)
 
 
-def test_smallest_limit_applies_to_tables_with_the_same_read_function() -> None:
+def test_the_smallest_limit_applies_to_tables_with_the_same_read_function() -> None:
     class Narrow(Mixed):
         most_registers = {HOLDING_MULTIPLE: 2, HOLDING: 3}
 
@@ -473,7 +475,7 @@ def test_smallest_limit_applies_to_tables_with_the_same_read_function() -> None:
     assert len(blocks(drive, [Narrow.low, Narrow.multiple, Narrow.read_only])) == 2
 
 
-def test_register_of_one_word_can_be_written_by_function_10h() -> None:
+def test_a_register_of_one_word_can_be_written_by_function_10h() -> None:
     drive, sim = Mixed(1), SimulatedDrive(Mixed(1))
     request = write_request(drive, Mixed.multiple, 7)
     assert request == Message(1, 0x10, 2, 1, b"\0\7")

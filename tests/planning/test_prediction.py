@@ -57,7 +57,7 @@ def asked(drive: Drive, every: float | None = None, *names: str) -> list[Planned
     return planned(drive, [(register, every) for register in registers])
 
 
-def test_predicted_bus_cycle_includes_characters_response_delays_and_silences() -> None:
+def test_the_predicted_bus_cycle_includes_characters_response_delays_and_silences() -> None:
     drives = [Simple(1, name="one", format="8N1"), Simple(2, name="two", format="8N1")]
     found = predict([each for drive in drives for each in asked(drive)])
     assert found.cycle == pytest.approx(4 * (OWN + SILENCE))
@@ -67,7 +67,7 @@ def test_predicted_bus_cycle_includes_characters_response_delays_and_silences() 
     assert found.exchanges_per_second(drives[0]) == pytest.approx(2 / found.cycle)
 
 
-def test_prediction_simulates_equal_lines_only_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_prediction_simulates_equal_lines_only_once(monkeypatch: pytest.MonkeyPatch) -> None:
     begun = 0
 
     class CountedSchedule(prediction.Schedule[prediction.Job]):
@@ -87,13 +87,13 @@ def test_prediction_simulates_equal_lines_only_once(monkeypatch: pytest.MonkeyPa
     assert begun == 3
 
 
-def test_prediction_includes_a_shorter_silence_declared_for_a_drive() -> None:
+def test_the_prediction_includes_a_shorter_silence_declared_for_a_drive() -> None:
     usual, short = ErmanERG220(1), ErmanERG220(1, silence=500e-6)
     cycles = [predict(asked(each, None, "output_current")).cycle for each in (usual, short)]
     assert cycles[0] - cycles[1] == pytest.approx(1.25e-3)
 
 
-def test_prediction_includes_10_ms_of_silence_before_and_after_an_innovert_ibd() -> None:
+def test_the_prediction_includes_10_ms_of_silence_before_and_after_an_innovert_ibd() -> None:
     """In a cycle of three drives, two of the three silences are those of the INNOVERT IBD."""
     che, other, ibd = InvtCHE(1, format="8N1"), InvtCHE(2, format="8N1"), InnovertIBD(3)
     exchanges = [asked(one, None, "output_current") for one in (che, other, ibd)]
@@ -102,7 +102,7 @@ def test_prediction_includes_10_ms_of_silence_before_and_after_an_innovert_ibd()
     assert found.cycle == pytest.approx(own + 2 * (10e-3 + BIT) + SILENCE)
 
 
-def test_prediction_includes_the_time_of_each_change_of_line_settings() -> None:
+def test_the_prediction_includes_the_time_of_each_change_of_line_settings() -> None:
     drives = [ErmanERG220(1), YD1000(2), ErmanERG220(3)]
     exchanges = [each for drive in drives for each in asked(drive, None, "output_frequency")]
     free, dear = predict(exchanges), predict(exchanges, switching=0.01)
@@ -110,7 +110,7 @@ def test_prediction_includes_the_time_of_each_change_of_line_settings() -> None:
     assert (free.switches, predict(asked(ErmanERG220(1))).switches) == (2, 0)
 
 
-def test_prediction_for_a_network_port_includes_no_change_of_line_settings() -> None:
+def test_the_prediction_for_a_network_port_includes_no_change_of_line_settings() -> None:
     drives = [InvtCHE(1, baudrate=9600), InvtCHE(2, baudrate=19200)]
     for drive in drives:
         drive.take_framing_of("tcp://10.0.0.7")
@@ -131,13 +131,13 @@ def test_suggested_settings_include_the_time_of_changing_line_settings() -> None
     assert periods[1] > periods[0]
 
 
-def test_prediction_uses_measured_instead_of_documented_response_delays() -> None:
+def test_the_prediction_uses_measured_instead_of_documented_response_delays() -> None:
     one, two = Simple(1), Simple(2)
     exchanges = [*asked(one), *asked(two)]
     assert predict(exchanges, {one: 9e-3}).cycle == pytest.approx(predict(exchanges).cycle + 2 * 5e-3)
 
 
-def test_registers_without_a_period_get_the_line_time_that_others_leave() -> None:
+def test_registers_without_a_period_use_the_remaining_line_time() -> None:
     timed, eager = Simple(1, format="8N1"), Simple(2, format="8N1")
     found = predict([*asked(timed, 0.1), *asked(eager)])
     load = 2 * (OWN + SILENCE) / 0.1
@@ -146,7 +146,7 @@ def test_registers_without_a_period_get_the_line_time_that_others_leave() -> Non
     assert predict(asked(timed, 0.1)).utilisation == pytest.approx(load)
 
 
-def test_predicted_rate_is_at_most_the_rate_that_the_line_allows() -> None:
+def test_the_predicted_rate_is_at_most_the_rate_that_the_line_allows() -> None:
     drives = [Simple(address, format="8N1") for address in range(1, 5)]
     found = predict([each for drive in drives for each in asked(drive, 0.05)])
     assert found.utilisation == pytest.approx(8 * (OWN + SILENCE) / 0.05)
@@ -154,7 +154,7 @@ def test_predicted_rate_is_at_most_the_rate_that_the_line_allows() -> None:
     assert [rate.reached for rate in found.rates] == pytest.approx([1 / found.cycle] * 4, rel=0.01)
 
 
-def test_drive_without_a_period_keeps_its_share_of_an_overloaded_line() -> None:
+def test_a_drive_without_a_period_is_polled_on_an_overloaded_line() -> None:
     hasty, eager = Simple(1, name="hasty", format="8N1"), Simple(2, name="eager", format="8N1")
     found = predict([*asked(hasty, 0.02), *asked(eager)])
     assert [(rate.drive.name, rate.fits) for rate in found.rates] == [("hasty", False), ("eager", True)]
@@ -162,7 +162,7 @@ def test_drive_without_a_period_keeps_its_share_of_an_overloaded_line() -> None:
     assert found.rates[0].reached == pytest.approx((1 - TURN_SHARE) / (2 * (OWN + SILENCE)), rel=0.01)
 
 
-def test_prediction_adds_the_delay_of_the_computer_to_each_exchange() -> None:
+def test_the_prediction_adds_the_delay_of_the_computer_to_each_exchange() -> None:
     exchanges = [*asked(Simple(1)), *asked(Simple(2))]
     assert predict_with_host(exchanges).cycle == pytest.approx(predict(exchanges).cycle + 4 * LATENESS)
 
@@ -201,7 +201,7 @@ def carried_out(exchanges: Sequence[Planned]) -> float:
         max_size=8,
     )
 )
-def test_bus_cycle_of_the_c_core_takes_the_predicted_time(wanted: list[tuple[str, int, int]]) -> None:
+def test_the_bus_cycle_of_the_c_core_takes_the_predicted_time(wanted: list[tuple[str, int, int]]) -> None:
     exchanges: list[Planned] = []
     for address, (model, framing, count) in enumerate(wanted, 1):
         family = MODELS[model]
@@ -260,7 +260,7 @@ def test_each_suggested_change_makes_the_line_reach_its_polling_rates(which: str
     assert predict(with_suggestion(drives, found, 0.15, which)).fits
 
 
-def test_suggested_change_is_no_larger_than_needed() -> None:
+def test_a_suggested_change_is_no_larger_than_needed() -> None:
     drive = Simple(1)
     exchanges = asked(drive, 0.045)  # the two exchanges take 51 ms
     found = suggest(exchanges, predict(exchanges))
@@ -270,7 +270,7 @@ def test_suggested_change_is_no_larger_than_needed() -> None:
     assert found.registers == 2  # one request
 
 
-def test_change_that_does_not_help_is_not_suggested() -> None:
+def test_a_change_that_does_not_help_is_not_suggested() -> None:
     drive = YD1000(1)
     exchanges = asked(drive, 0.001, "output_frequency")
     found = suggest(exchanges, predict(exchanges))
@@ -280,7 +280,7 @@ def test_change_that_does_not_help_is_not_suggested() -> None:
     assert "every" in str(found)
 
 
-def test_duration_text_returns_the_notation_of_plant_files() -> None:
+def test_a_duration_is_shown_in_the_notation_of_plant_files() -> None:
     assert [duration_text(each) for each in (0.05, 0.0025, 1.0, 60.0)] == ["50 ms", "2.5 ms", "1 s", "60 s"]
 
 

@@ -52,29 +52,29 @@ def fail(made: Schedule[Job], drive: int, failures: int, now_ms: int, late_until
     made.back_off.observe(drive, failures, now_ms * MS, late_until_ns=late_until_ms * MS, cost_ns=0)
 
 
-def test_polls_are_due_at_multiples_of_the_period_whenever_they_are_planned() -> None:
+def test_periodic_polls_are_due_at_multiples_of_the_period() -> None:
     made = schedule(poll := job(period_ms=20))
     planned = [due for now in range(0, 1000, 37) for _, due in take(made, now, 100)]
     assert planned == list(range(0, planned[-1] + 1, 20))
     assert poll.skipped == 0
 
 
-def test_polls_missed_during_a_stall_are_counted_and_skipped() -> None:
+def test_missed_polls_of_a_stall_are_counted_and_skipped() -> None:
     made = schedule(poll := job(period_ms=20))
     assert take(made, 0, 1) == [(poll, 0)]
-    assert take(made, 110, 1) == [(poll, 100)]  # the slots that started at 20, 40, 60 and 80 ms have ended
+    assert take(made, 110, 1) == [(poll, 100)]  # the polls due at 20, 40, 60 and 80 ms were missed
     assert poll.skipped == 4
     assert take(made, 111, 10) == [(poll, 120)]
 
 
-def test_poll_whose_slot_ends_before_the_line_is_free_is_not_queued() -> None:
-    """Earlier requests keep the line busy until the slot has ended."""
+def test_a_poll_whose_slot_ends_before_the_line_is_free_is_not_queued() -> None:
+    """Earlier requests keep the line busy until the poll's period is over."""
     made = schedule(poll := job(period_ms=20))
     assert made.take(0, 110 * MS, 111 * MS, 9) == [(poll, 100 * MS, 100 * MS)]
     assert poll.skipped == 5
 
 
-def test_most_urgent_poll_is_sent_first_and_polls_without_period_fill_the_rest() -> None:
+def test_the_most_urgent_poll_is_sent_first() -> None:
     timed, late = job(1, 40), job(2, 60)
     first, second, third = job(3), job(4), job(5)
     made = schedule(first, late, second, timed, third)
@@ -93,18 +93,20 @@ def test_slow_polls_that_are_due_together_do_not_delay_a_fast_poll() -> None:
     assert [each.skipped for each in made.jobs] == [0] * 31
 
 
-def test_every_poll_gets_a_share_of_an_overloaded_line() -> None:
+def test_every_poll_is_sent_on_an_overloaded_line() -> None:
     fast = [job(drive, 20, duration_ms=10) for drive in (1, 2, 3)]
     slow = [job(drive, 1000, duration_ms=10) for drive in (4, 5)]
     turn = [job(drive, duration_ms=10) for drive in (6, 7)]
     made = schedule(*turn, *fast, *slow)
     done = carry_out(made, 100)
     counts = {each: sum(1 for other, _, _ in done if other is each) for each in made.jobs}
-    assert [counts[each] for each in slow] == pytest.approx([100, 100], abs=1)  # the slow jobs lose no slot
+    assert [counts[each] for each in slow] == pytest.approx(
+        [100, 100], abs=1
+    )  # no poll of a slow job is skipped
     assert max(counts[each] for each in fast) - min(counts[each] for each in fast) <= 2
     assert sum(counts[each] for each in turn) / len(done) == pytest.approx(TURN_SHARE, abs=0.002)
     assert abs(counts[turn[0]] - counts[turn[1]]) <= 1
-    for each in (*fast, *slow):  # every slot was either carried out or counted as skipped
+    for each in (*fast, *slow):  # every due poll was either sent or counted as skipped
         slots = 100_000 * MS // (each.period_ns or 1)
         assert counts[each] + each.skipped == pytest.approx(slots, abs=1)
 
@@ -148,7 +150,7 @@ def test_polls_without_a_period_are_sent_one_after_another() -> None:
     assert [each for each, _ in take(made, 0, 10)] == jobs[2:4]
 
 
-def test_interrupted_round_of_polls_continues_at_the_same_poll() -> None:
+def test_an_interrupted_round_of_polls_continues_at_the_same_poll() -> None:
     """If the round started again from its first job, frequent interruptions would starve the last jobs."""
     jobs = [job(drive) for drive in range(5)]
     made = schedule(*jobs)
@@ -164,12 +166,12 @@ def test_interrupted_round_of_polls_continues_at_the_same_poll() -> None:
     assert made.cycle(15 * MS)[0] in jobs
 
 
-def test_take_returns_at_most_the_given_number_of_requests() -> None:
+def test_a_schedule_returns_at_most_the_given_number_of_requests() -> None:
     made = schedule(job(1), job(2, 10))
     assert len(take(made, 0, 1000, most=7)) == 7
 
 
-def test_schedule_returns_at_least_one_request_even_if_it_is_long() -> None:
+def test_a_schedule_returns_at_least_one_request_even_if_it_is_long() -> None:
     made = schedule(long := job(duration_ms=500))
     assert take(made, 0, 1) == [(long, 0)]
 
@@ -181,10 +183,10 @@ def test_no_request_is_planned_if_queued_requests_last_until_the_horizon() -> No
 
 
 @pytest.mark.parametrize(("silence", "end_ms"), [({}, 25), ({"silence_ns": 2 * MS}, 23)])
-def test_silence_of_a_request_takes_no_time_if_the_line_was_idle(
+def test_the_silence_before_a_request_takes_no_time_on_an_idle_line(
     silence: dict[str, int], end_ms: int
 ) -> None:
-    """The line is idle from 15 to 20 ms, when the second slots start."""
+    """The line is idle from 15 to 20 ms, when the jobs are due again."""
     for later_ns, planned in ((0, 1), (1, 2), (5 * MS, 2), (5 * MS + 1, 3)):
         jobs = [Job(drive=drive, period_ns=20 * MS, duration_ns=5 * MS, **silence) for drive in (1, 2, 3)]
         made = schedule(*jobs)
@@ -192,7 +194,7 @@ def test_silence_of_a_request_takes_no_time_if_the_line_was_idle(
         assert len(made.take(15 * MS, 15 * MS, end_ms * MS + later_ns, 9)) == planned
 
 
-def test_silent_drive_is_asked_less_often_each_time_while_others_are_polled() -> None:
+def test_a_silent_drive_is_asked_less_often_each_time_while_others_are_polled() -> None:
     dead, alive = job(1), job(2)
     made = schedule(dead, alive)
     fail(made, 1, 2, now_ms=0)
@@ -210,7 +212,7 @@ def test_silent_drive_is_asked_less_often_each_time_while_others_are_polled() ->
     assert LONGEST_PAUSE_NS // MS <= rests[-1] <= LONGEST_PAUSE_NS // MS + 100
 
 
-def test_silent_drive_is_asked_again_exactly_when_its_pause_ends() -> None:
+def test_a_silent_drive_is_asked_again_exactly_when_its_pause_ends() -> None:
     made = schedule(dead := job(1))
     at = 0
     for failures, rest_ms in enumerate([500, 1000, 2000, 2000], 2):
@@ -229,7 +231,7 @@ def test_a_drive_with_long_timeouts_has_only_one_short_pause() -> None:
         assert [each for each, _, _ in made.take(end, end, end + 1, 9)] == [lossy]
 
 
-def test_requests_to_silent_drives_use_at_most_their_share_of_the_line() -> None:
+def test_requests_to_silent_drives_take_a_limited_share_of_time() -> None:
     jobs = [job(drive, duration_ms=40) for drive in range(10)]
     made = schedule(*jobs, job(99))
     cost_ms, asked = 300, 0
@@ -251,7 +253,7 @@ def test_requests_to_silent_drives_use_at_most_their_share_of_the_line() -> None
 @pytest.mark.story
 @pytest.mark.parametrize("dead", usually(10, 1, 5))
 @pytest.mark.parametrize("period_ms", [None, 400], ids=["in turn", "at a rate"])
-def test_drives_keep_97_percent_of_their_rate_beside_dead_drives(dead: int, period_ms: int | None) -> None:
+def test_a_drive_keeps_97_percent_of_its_rate_beside_dead_drives(dead: int, period_ms: int | None) -> None:
     """Of 31 drives, some are dead. The others keep 97 % of the rate that they have without the dead ones."""
     answered: list[int] = []
     for count in (31, 31 - dead):
@@ -307,14 +309,14 @@ def test_a_silent_drive_is_retried_even_without_spare_time() -> None:
     assert asked >= 3
 
 
-def test_drive_gets_no_request_while_its_late_reply_may_come() -> None:
+def test_a_drive_gets_no_request_while_its_late_reply_may_come() -> None:
     made = schedule(poll := job(1), other := job(2))
     fail(made, 1, 1, now_ms=0, late_until_ms=300)
     assert {each for each, _ in take(made, 0, 299)} == {other}
     assert poll in {each for each, _ in take(made, 300, 20)}
 
 
-def test_drive_gets_a_request_once_its_late_reply_has_come() -> None:
+def test_a_drive_gets_a_request_once_its_late_reply_has_come() -> None:
     made = schedule(poll := job(1), job(2))
     fail(made, 1, 1, now_ms=0, late_until_ms=900)
     assert poll not in [each for each, _ in take(made, 0, 100)]
@@ -342,11 +344,11 @@ def test_polls_with_the_present_line_settings_go_first_if_time_permits() -> None
 def test_the_most_urgent_poll_goes_first_again_after_a_delay() -> None:
     made = schedule(quick := job(1, 10, 2), slow := job(2, 1000, 2), middling := job(3, 100, 2))
     take(made, 0, 1, most=3)
-    taken = take(made, 1000, 1010)  # the quick job's slots of the last second have ended
+    taken = take(made, 1000, 1010)  # the quick job's polls of the last second were missed
     assert [each for each, due in taken if due >= 2000] == [quick, middling, slow]
 
 
-def test_due_poll_is_skipped_if_its_drive_falls_silent() -> None:
+def test_a_due_poll_is_skipped_if_its_drive_falls_silent() -> None:
     made = schedule(one := job(1, 100), two := job(2, 100))
     assert take(made, 0, 100, most=1) == [(one, 0)]
     fail(made, 2, 1, now_ms=5, late_until_ms=60)
@@ -361,7 +363,7 @@ def test_other_drives_are_polled_while_a_drive_is_paused() -> None:
     assert [each for each, _ in take(made, 0, 40)] == [jobs[0], jobs[2], jobs[0], jobs[2]]
 
 
-def test_schedule_reserves_the_whole_timeout_for_a_request_to_a_silent_drive() -> None:
+def test_the_schedule_reserves_the_whole_timeout_for_a_request_to_a_silent_drive() -> None:
     made = schedule(dead := job(1), job(2))
     made.back_off.observe(1, 2, 0, late_until_ns=0, cost_ns=2 * MS)
     take(made, 1, 400)
@@ -397,12 +399,12 @@ def test_a_poll_without_a_period_is_missed_once_per_pause() -> None:
     assert made.unasked == [(poll, 7 * MS)]
 
 
-def test_skipping_everything_returns_polls_without_a_period_too() -> None:
+def test_a_skip_of_all_polls_includes_polls_without_a_period() -> None:
     made = schedule(poll := job(1, period_ms=100), fast := job(2))
     assert made.pass_all(150 * MS) == [(fast, 150 * MS), (poll, 0), (poll, 100 * MS)]
 
 
-def test_skipped_slots_are_those_that_were_due_but_not_requested() -> None:
+def test_a_poll_that_was_due_but_not_sent_is_skipped() -> None:
     made = schedule(poll := job(1, period_ms=100), job(2))
     take(made, 0, 50)
     assert made.pass_slots(250 * MS) == [(poll, 100 * MS), (poll, 200 * MS)]
@@ -414,7 +416,7 @@ def test_a_poll_that_is_due_now_is_skipped_too() -> None:
     assert made.pass_slots(100 * MS) == [(begun, 0), (one, 100 * MS), (two, 100 * MS)]
 
 
-def test_removing_a_poll_keeps_the_order_of_the_others() -> None:
+def test_the_order_of_polls_stays_when_one_is_removed() -> None:
     jobs = [job(drive) for drive in range(4)]
     made = schedule(*jobs, timed := job(9, 1000), other := job(8, 1000))
     assert [each for each, _ in take(made, 0, 20)] == [timed, other, *jobs[:2]]
@@ -425,14 +427,14 @@ def test_removing_a_poll_keeps_the_order_of_the_others() -> None:
     assert made.jobs == [*jobs[1:], other]
 
 
-def test_poll_that_is_removed_when_it_is_due_is_not_sent() -> None:
+def test_a_poll_that_is_removed_when_it_is_due_is_not_sent() -> None:
     made = schedule(first := job(1, 1000), second := job(2, 1000))
     assert take(made, 0, 100, most=1) == [(first, 0)]
     made.remove(second)
     assert take(made, 5, 100) == []
 
 
-def test_a_poll_gets_the_turn_and_due_time_of_the_poll_it_replaces() -> None:
+def test_a_new_poll_gets_the_place_and_due_time_of_the_replaced_one() -> None:
     jobs = [job(drive) for drive in range(4)]
     made = schedule(*jobs)
     assert [each for each, _ in take(made, 0, 10)] == jobs[:2]
@@ -446,14 +448,14 @@ def test_a_poll_gets_the_turn_and_due_time_of_the_poll_it_replaces() -> None:
     assert set(made.jobs) == {jobs[1], both, one, other, slower}
 
 
-def test_a_new_order_of_drives_starts_a_new_round() -> None:
+def test_a_new_order_of_drives_starts_with_the_first_drive() -> None:
     made = schedule(*(jobs := [job(drive) for drive in range(3)]))
     assert take(made, 0, 1) == [(jobs[0], 0)]
     made.put_in_order([2, 1, 0])
     assert [asked for asked, _ in take(made, 100, 15)] == [jobs[2], jobs[1], jobs[0]]
 
 
-def test_a_poll_without_a_period_gets_the_turn_of_the_poll_it_replaces() -> None:
+def test_a_poll_without_a_period_gets_the_place_of_the_replaced_one() -> None:
     made = schedule(*(jobs := [job(drive) for drive in range(3)]))
     assert take(made, 0, 1) == [(jobs[0], 0)]
     made.replace(jobs[1:2], [new := job(1)], 0)
@@ -485,7 +487,7 @@ KINDS = st.lists(
 
 @pytest.mark.slow
 @given(KINDS, st.lists(st.integers(0, 60) | st.just(700), min_size=30, max_size=60))
-def test_polls_neither_drift_nor_pile_up_after_stalls(
+def test_periodic_polls_neither_drift_nor_pile_up_after_stalls(
     kinds: list[tuple[int, int | None, int, int]], stalls: list[int]
 ) -> None:
     """The line or the Python process stalls for longer than requests are planned in advance."""
@@ -496,21 +498,23 @@ def test_polls_neither_drift_nor_pile_up_after_stalls(
         for each, not_before, due in made.take(now, busy_until, now + 100 * MS, 64):
             busy_until = max(busy_until, now, not_before)
             if due is not None and each.period_ns:
-                assert busy_until < due + each.period_ns  # the slot has not ended
+                assert busy_until < due + each.period_ns  # the period is not over
                 slots[each].append(due)
             busy_until += each.duration_ns
         now += stall * MS
     for each, taken in slots.items():
         if each.period_ns:
-            # slots start at each multiple of the period
+            # polls are due at each multiple of the period
             assert all(due % each.period_ns == 0 for due in taken)
-            assert taken == sorted(set(taken))  # each slot is taken once
+            assert taken == sorted(set(taken))  # each poll is sent once
             assert each.due_ns // each.period_ns == len(taken) + each.skipped  # none uncounted
 
 
 @settings(max_examples=examples(50))
 @given(KINDS)
-def test_every_poll_gets_turns_on_any_overloaded_line(kinds: list[tuple[int, int | None, int, int]]) -> None:
+def test_every_poll_is_sent_repeatedly_on_any_overloaded_line(
+    kinds: list[tuple[int, int | None, int, int]],
+) -> None:
     made = schedule(*(job(*kind) for kind in kinds))
     done = carry_out(made, 3)
     # The limit is the sum of three waits: for one request of each other job, for jobs without a period, and
@@ -526,7 +530,7 @@ def test_every_poll_gets_turns_on_any_overloaded_line(kinds: list[tuple[int, int
 @settings(max_examples=examples(50))
 @given(KINDS)
 def test_no_poll_is_skipped_if_all_fit_into_one_period(kinds: list[tuple[int, int | None, int, int]]) -> None:
-    """All jobs together fit into the shortest period, so no slot is ever skipped."""
+    """All jobs together fit into the shortest period, so no poll is ever skipped."""
     least = sum(duration for _, _, duration, _ in kinds)
     made = schedule(*(job(d, p and p + least, duration, kind) for d, p, duration, kind in kinds))
     done = carry_out(made, 3)
@@ -536,7 +540,7 @@ def test_no_poll_is_skipped_if_all_fit_into_one_period(kinds: list[tuple[int, in
             assert sum(1 for other, _, _ in done if other is each) >= 2900 * MS // each.period_ns
 
 
-def test_answering_drive_gets_no_request_while_an_earlier_reply_may_still_come() -> None:
+def test_a_drive_gets_no_request_while_an_earlier_reply_may_come() -> None:
     """The first of two requests got no reply, so `late_until_ns` is set. The second one was answered."""
     made = schedule(quick := job(1), timed := job(2, period_ms=10))
     fail(made, 1, 0, now_ms=0, late_until_ms=100)
@@ -556,8 +560,8 @@ class Operation(RuleBasedStateMachine):
         self.made: Schedule[Job] = Schedule()
         self.now = self.busy_until = 1000 * MS
         self.added: dict[Job, int] = {}
-        self.slots: dict[Job, list[int]] = {}  # start times of the slots that were carried out
-        # number of slots that were reported as passed, because no request was sent
+        self.slots: dict[Job, list[int]] = {}  # times at which the sent polls were due
+        # number of polls that were reported as skipped
         self.passed: Counter[Job] = Counter()
         self.failures = dict.fromkeys(range(4), 0)
         self.silent_until = dict.fromkeys(range(4), 0)  # time until which a late reply may come, by drive
@@ -607,13 +611,13 @@ class Operation(RuleBasedStateMachine):
             assert each in self.made.jobs
             # No request is sent while a late reply may come, even if the line is ready earlier.
             assert max(self.now, not_before) >= self.silent_until[each.drive]
-            if each.period_ns and due is None:  # a retry of a silent drive uses no slot
+            if each.period_ns and due is None:  # a retry does not replace a periodic poll
                 assert self.failures[each.drive] >= 2
             elif each.period_ns:
-                # slots start at each multiple of the period
+                # polls are due at each multiple of the period
                 assert (due - self.added[each]) % each.period_ns == 0
-                assert due > max(self.slots[each], default=-1)  # each slot is taken once, in order
-                assert due > at - each.period_ns  # no request is made for a slot that has ended
+                assert due > max(self.slots[each], default=-1)  # each poll is sent once, in order
+                assert due > at - each.period_ns  # no request is made for a period that is over
                 self.slots[each].append(due)
             else:
                 self.slots[each].append(at)
@@ -648,7 +652,7 @@ TestOperation = Operation.TestCase
 TestOperation.settings = settings(max_examples=examples(100), stateful_step_count=30, deadline=None)
 
 
-def test_next_due_poll_is_found_after_another_poll_was_removed() -> None:
+def test_the_next_due_poll_is_found_after_another_poll_was_removed() -> None:
     made: Schedule[Job] = Schedule()
     jobs = {at: job(at, 1000) for at in (13, 14, 1, 15)}
     for at, each in jobs.items():
@@ -673,7 +677,7 @@ def test_the_order_of_polls_continues_after_a_poll_is_removed() -> None:
     assert [each for each, _ in take(made, 5, 1, 1)] == [third]
 
 
-def test_drive_that_was_forgotten_is_polled_like_a_new_drive() -> None:
+def test_a_drive_that_was_forgotten_is_polled_like_a_new_drive() -> None:
     made = schedule(silent := job(1), job(2))
     fail(made, 1, 9, 0)
     made.remove(silent)
@@ -694,7 +698,7 @@ def answer(made: Schedule[Job], asked: Job, now_ms: int) -> None:
     made.back_off.observe(asked.drive, 0, now_ms * MS, late_until_ns=0, cost_ns=0, has_answered=True)
 
 
-def test_new_drive_gets_one_request_until_its_result_is_known() -> None:
+def test_a_new_drive_gets_one_request_until_its_result_is_known() -> None:
     made = meet(one := job(1), two := job(1), job(2, period_ms=50), job(2))
     assert [asked.drive for asked, _ in take(made, 0, 1000)] == [2, 1]
     assert take(made, 10, 1000) == []
@@ -716,7 +720,7 @@ def test_no_poll_of_a_new_drive_is_lost_repeated_or_early() -> None:
     assert (fast.skipped, slow.skipped) == (0, 0)
 
 
-def test_new_drive_that_does_not_reply_gets_no_more_requests_for_a_while() -> None:
+def test_a_new_drive_that_does_not_reply_gets_no_more_requests_for_a_while() -> None:
     made = meet(dead := job(1), living := job(2))
     assert [asked for asked, _ in take(made, 0, 100)] == [dead, living]
     answer(made, living, 1)

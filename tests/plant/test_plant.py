@@ -182,18 +182,18 @@ def test_a_line_does_not_shorten_the_silence_that_a_family_needs(load: Load) -> 
     assert [polled.drive.needed_silence() for polled in line.drives] == pytest.approx([1.75e-3, 10e-3, 0])
 
 
-def test_echo_of_a_line_is_detected_unless_the_plant_file_declares_it(load: Load) -> None:
+def test_the_echo_of_a_line_is_detected_unless_the_plant_file_declares_it(load: Load) -> None:
     assert load(SILENT).lines[0].echo is Echo.AUTO
     assert load(SILENT.replace('silence = "500 us"', 'echo = "off"')).lines[0].echo is Echo.OFF
 
 
-def test_key_realtime_applies_to_all_lines_of_a_plant_file(load: Load, mistakes: Mistakes) -> None:
+def test_the_key_realtime_applies_to_all_lines_of_a_plant_file(load: Load, mistakes: Mistakes) -> None:
     assert load(GOOD).realtime is False
     assert load("realtime = true\n" + GOOD).realtime is True
     assert mistakes("realtime = 1\n" + GOOD) == ["realtime = 1 is not right; write realtime = true"]
 
 
-def test_drive_without_poll_polls_all_readings_as_fast_as_possible(load: Load) -> None:
+def test_a_drive_without_poll_polls_all_readings_as_fast_as_possible(load: Load) -> None:
     (pump,) = load(GOOD).lines[1].drives
     assert [(poll.register.name, poll.every) for poll in pump.polls] == [
         ("output_frequency", None),
@@ -201,7 +201,7 @@ def test_drive_without_poll_polls_all_readings_as_fast_as_possible(load: Load) -
     ]
 
 
-def test_byte_order_mark_of_a_plant_file_is_skipped(load: Load) -> None:
+def test_the_byte_order_mark_of_a_plant_file_is_skipped(load: Load) -> None:
     assert load("\ufeff" + SILENT).metadata() == load(SILENT).metadata()
 
 
@@ -212,7 +212,7 @@ def test_framing_and_options_in_a_plant_file_reach_the_drive(load: Load) -> None
     assert pump.drive.option == {"rated_frequency": 60}
 
 
-def test_error_names_the_line_number_of_the_wrong_key_or_table(load: Load) -> None:
+def test_an_error_names_the_line_number_of_the_wrong_key_or_table(load: Load) -> None:
     text = (
         GOOD.replace('port = "/dev/ttyUSB0"', 'prot = "/dev/ttyUSB0"')
         .replace('"output_current",', '"output_curent",')
@@ -226,7 +226,7 @@ def test_error_names_the_line_number_of_the_wrong_key_or_table(load: Load) -> No
     assert all(rows[number - 1].startswith(start) for number, start in zip(numbers, starts, strict=True))
 
 
-def test_same_mistake_in_many_drives_is_reported_once_with_a_count(load: Load) -> None:
+def test_the_same_mistake_in_many_drives_is_reported_once_with_a_count(load: Load) -> None:
     drives = (
         TOY.replace('"D"', f'"D{address}"').replace("address = 1", f"address = {address}")
         + 'poll = ["output_curent"]\n'
@@ -239,7 +239,7 @@ def test_same_mistake_in_many_drives_is_reported_once_with_a_count(load: Load) -
     assert sentence.endswith("; the same in 30 more places")
 
 
-def test_five_mistakes_in_one_plant_file_are_reported_together(mistakes: Mistakes) -> None:
+def test_all_mistakes_in_a_plant_file_are_reported_together(mistakes: Mistakes) -> None:
     text = (
         GOOD.replace('port = "/dev/ttyUSB0"', 'prot = "/dev/ttyUSB0"')
         .replace('"output_current",', '"output_curent",')
@@ -453,12 +453,12 @@ def test_each_drive_key_that_the_family_refuses_is_reported(mistakes: Mistakes) 
     ]
 
 
-def test_plant_file_path_that_is_too_long_is_reported() -> None:
+def test_a_plant_file_path_that_is_too_long_is_reported() -> None:
     with pytest.raises(PlantError, match="the plant file cannot be read: File name too long"):
         load_plant("x" * 5000)
 
 
-def test_unreadable_plant_file_is_reported_in_one_sentence(tmp_path: Path) -> None:
+def test_an_unreadable_plant_file_is_reported_in_one_sentence(tmp_path: Path) -> None:
     with pytest.raises(
         PlantError, match=r"none.toml: the plant file cannot be read: No such file or directory"
     ):
@@ -483,7 +483,7 @@ SCANNED = "is a port, not a plant file; `multidrop scan {} --out plant.toml` wri
         ("/dev/ttyUSB0", SCANNED.format("/dev/ttyUSB0")),
     ],
 )
-def test_url_or_port_name_instead_of_a_plant_file_is_reported(name: str, expected: str) -> None:
+def test_a_url_or_port_name_instead_of_a_plant_file_is_reported(name: str, expected: str) -> None:
     for given in (name, Path(name)):  # Path reduces two slashes to one, so both types are tried
         with pytest.raises(PlantError) as raised:
             load_plant(given)
@@ -491,7 +491,7 @@ def test_url_or_port_name_instead_of_a_plant_file_is_reported(name: str, expecte
         assert expected in str(raised.value)
 
 
-def test_family_file_given_as_plant_file_is_reported_in_one_sentence(tmp_path: Path) -> None:
+def test_a_family_file_given_as_plant_file_is_reported_in_one_sentence(tmp_path: Path) -> None:
     path = tmp_path / "meter.toml"
     path.write_text('[family]\ntitle = "Meter"\n\n[reading]\nvoltage = { at = "30001" }\n')
     with pytest.raises(PlantError) as raised:
@@ -500,7 +500,7 @@ def test_family_file_given_as_plant_file_is_reported_in_one_sentence(tmp_path: P
     assert sentence.startswith(f"{path}: this is a family file, not a plant file")
 
 
-def test_device_path_given_as_plant_file_is_not_read() -> None:
+def test_a_device_path_given_as_plant_file_is_not_read() -> None:
     """Reading a serial port would block, and take bytes from its line."""
     with pytest.raises(PlantError, match=r": this is a device, not a plant file$"):
         load_plant(os.devnull)
@@ -517,7 +517,7 @@ def test_device_path_given_as_plant_file_is_not_read() -> None:
     ],
     ids=["nested", "dotted", "long dotted", "decimal", "hexadecimal"],
 )
-def test_plant_file_that_tomllib_rejects_is_reported(tmp_path: Path, text: str, sentence: str) -> None:
+def test_a_plant_file_that_tomllib_rejects_is_reported(tmp_path: Path, text: str, sentence: str) -> None:
     (tmp_path / "a.toml").write_text(text)
     with pytest.raises(PlantError, match=sentence) as found:
         load_plant(tmp_path / "a.toml")
@@ -535,7 +535,7 @@ UNDOCUMENTED = ("spy:///dev/null?file={}", "SPY://x?file={}", "alt://x?class={}"
 
 
 @pytest.mark.parametrize("port", UNDOCUMENTED)
-def test_port_urls_with_undocumented_schemes_are_refused(mistakes: Mistakes, port: str) -> None:
+def test_a_port_url_with_an_undocumented_scheme_is_refused(mistakes: Mistakes, port: str) -> None:
     """For example, pyserial's spy:// would overwrite the file that the URL names."""
     (sentence,) = mistakes((HEAD + TOY).replace('port = "/dev/a"', f'port = "{port}"'))
     scheme = port.partition(":")[0]
@@ -545,7 +545,7 @@ def test_port_urls_with_undocumented_schemes_are_refused(mistakes: Mistakes, por
     )
 
 
-def test_port_url_with_a_user_is_refused_without_showing_the_password(mistakes: Mistakes) -> None:
+def test_a_port_url_with_a_user_is_refused_without_showing_the_password(mistakes: Mistakes) -> None:
     (sentence,) = mistakes((HEAD + TOY).replace('port = "/dev/a"', 'port = "tcp://bob:S3C@ET@10.0.0.7"'))
     assert "tcp://10.0.0.7: it has a user or a password" in sentence
     assert "S3C" not in sentence
@@ -557,7 +557,7 @@ def test_reserved_names_of_lines_and_drives_are_refused(mistakes: Mistakes) -> N
     assert drive.startswith('line "..", drive "stop": name "stop" is reserved for the MQTT topic PREFIX/stop')
 
 
-def test_family_file_name_that_is_too_long_is_reported(mistakes: Mistakes) -> None:
+def test_a_family_file_name_that_is_too_long_is_reported(mistakes: Mistakes) -> None:
     (sentence,) = mistakes(HEAD + TOY.replace("family.py:Toy", "a" * 300 + ".py"))
     # Windows has the second text
     assert sentence.endswith((".py: File name too long", ".py does not exist"))
@@ -566,7 +566,7 @@ def test_family_file_name_that_is_too_long_is_reported(mistakes: Mistakes) -> No
 @table(
     ("text", "expected"), [("500 us", 500e-6), ("50ms", 0.05), ("2 s", 2), ("1.5 min", 90), (" 1 h ", 3600)]
 )
-def test_parse_duration_returns_the_seconds_of_a_text_such_as_100ms(text: str, expected: float) -> None:
+def test_a_text_such_as_100ms_is_read_as_a_duration(text: str, expected: float) -> None:
     assert parse_duration(text) == pytest.approx(expected)
 
 
@@ -645,7 +645,7 @@ def test_unknown_lines_and_duplicate_new_ports_are_refused(tmp_path: Path) -> No
         plant.with_ports({"roof": "/dev/hall"})
 
 
-def test_plant_finds_lines_and_drives_by_name(tmp_path: Path) -> None:
+def test_a_plant_finds_lines_and_drives_by_name(tmp_path: Path) -> None:
     plant = load_plant(two_lines(tmp_path))
     assert plant.find_line("roof") is plant.lines[1]
     line, drive = plant.find_drive("pump-2")
@@ -655,7 +655,7 @@ def test_plant_finds_lines_and_drives_by_name(tmp_path: Path) -> None:
 
 
 @table("every", [0, 0.0, -1.0, 0.00009, 86401.0, float("nan"), float("inf"), True, "1 s"])
-def test_polling_period_outside_the_limits_is_refused(every: Any) -> None:
+def test_a_polling_period_outside_the_limits_is_refused(every: Any) -> None:
     """A period of 0 s would make the polling of the whole line fail."""
 
     register = YD1000.register("status")
@@ -664,7 +664,7 @@ def test_polling_period_outside_the_limits_is_refused(every: Any) -> None:
     assert Polled(register, None).every is None
 
 
-def test_star_polls_all_readings_and_keeps_rates_given_for_single_ones(load: Load) -> None:
+def test_a_star_in_the_poll_list_means_all_readings(load: Load) -> None:
     def polls(entries: str) -> dict[str, float | None]:
         (line,) = load(HEAD + TOY + f'every = "1 s"\npoll = {entries}').lines
         return {poll.register.name: poll.every for poll in line.drives[0].polls}
@@ -681,7 +681,7 @@ def test_star_polls_all_readings_and_keeps_rates_given_for_single_ones(load: Loa
     }
 
 
-def test_polling_a_text_register_is_reported_as_a_mistake(mistakes: Mistakes, tmp_path: Path) -> None:
+def test_a_text_register_in_a_poll_list_is_a_mistake(mistakes: Mistakes, tmp_path: Path) -> None:
     (tmp_path / "meter.toml").write_text(
         '[family]\ntitle = "Meter"\nmanual = "M"\ncounts_from = 0\n'
         "[reading]\npower = { at = 1 }\n[text]\nmark = { at = 9, length = 4 }\n"
@@ -712,7 +712,7 @@ SHORT, LONG = "\u0439", "\u0438\u0306"
         ("", [], ""),
     ],
 )
-def test_drive_name_is_found_by_its_unicode_normal_form(given: str, names: list[str], meant: str) -> None:
+def test_a_drive_name_is_found_by_its_unicode_normal_form(given: str, names: list[str], meant: str) -> None:
     assert drive_meant(given, names) == meant
 
 
@@ -793,7 +793,7 @@ WRONG_CHANNELS = (
 
 
 @pytest.mark.parametrize(("right", "wrong", "line", "sentence"), WRONG_CHANNELS)
-def test_mistake_in_a_computed_channel_is_reported_with_file_and_line(
+def test_a_mistake_in_a_computed_channel_is_reported_with_file_and_line(
     tmp_path: Path, right: str, wrong: str, line: int, sentence: str
 ) -> None:
     assert right in FILE
@@ -804,7 +804,7 @@ def test_mistake_in_a_computed_channel_is_reported_with_file_and_line(
     assert sentence in first
 
 
-def test_drive_with_a_mistake_in_its_channel_can_still_be_stopped(tmp_path: Path) -> None:
+def test_a_drive_with_a_mistake_in_its_channel_can_still_be_stopped(tmp_path: Path) -> None:
     with pytest.raises(PlantError) as mistake:
         loaded(tmp_path, FILE.replace("integral(", "integrall("))
     assert mistake.value.right is not None

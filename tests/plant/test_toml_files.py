@@ -114,11 +114,11 @@ def mistake(data: str | bytes) -> tuple[int, str]:
         (b"a = 1\nb = '\xe4'", 2, "the file is not text in UTF-8, from byte 11 on (0xE4); save it as UTF-8"),
     ],
 )
-def test_text_that_is_not_toml_is_reported_with_advice(text: str | bytes, line: int, sentence: str) -> None:
+def test_a_text_that_is_not_toml_is_reported_with_advice(text: str | bytes, line: int, sentence: str) -> None:
     assert mistake(text) == (line, sentence)
 
 
-def test_long_line_with_a_toml_mistake_is_reported_quickly_and_shortened() -> None:
+def test_a_long_line_with_a_toml_mistake_is_reported_quickly_and_shortened() -> None:
     line, sentence = mistake("name = " + "x" * 500_000 + "é" * 500_000)
     assert (line, len(sentence) < 200) == (1, True)
 
@@ -183,7 +183,7 @@ b = 1
         (["absent"], "absent", 0),
     ],
 )
-def test_error_names_the_line_number_of_its_toml_key_in_any_layout(
+def test_an_error_names_the_line_number_of_its_toml_key_in_any_layout(
     tmp_path: Path, steps: list[str | tuple[str, int]], key: str, line: int
 ) -> None:
     (tmp_path / "a.toml").write_text(LAYOUT)
@@ -196,7 +196,7 @@ def test_error_names_the_line_number_of_its_toml_key_in_any_layout(
     assert error.startswith(f"{tmp_path}/a.toml:{line}: " if line else f"{tmp_path}/a.toml: ")
 
 
-def test_toml_file_that_no_longer_exists_has_no_line_numbers(tmp_path: Path) -> None:
+def test_a_toml_file_that_no_longer_exists_has_no_line_numbers(tmp_path: Path) -> None:
     assert line_numbers(tmp_path / "none.toml") == {}
     assert line_numbers(tmp_path) == {}
 
@@ -209,7 +209,7 @@ def test_an_error_that_starts_with_a_key_has_its_line_number(tmp_path: Path) -> 
     assert [error.split(": ")[0].rpartition(":")[2] for error in place.config_errors] == ["3", "1"]
 
 
-def test_long_toml_table_in_an_error_is_shortened(tmp_path: Path) -> None:
+def test_a_long_toml_table_in_an_error_is_shortened(tmp_path: Path) -> None:
     place = TomlPlace(tmp_path / "a.toml")
     place.check({"line": {"name": "x" * 100}}, {"line": Key(list, "[[line]], in two brackets")})
     (error,) = place.config_errors
@@ -217,7 +217,7 @@ def test_long_toml_table_in_an_error_is_shortened(tmp_path: Path) -> None:
     assert len(error) < len(str(tmp_path)) + 150
 
 
-def test_toml_table_in_the_wrong_place_is_reported_with_the_right_header(tmp_path: Path) -> None:
+def test_a_toml_table_in_the_wrong_place_is_reported_with_the_right_header(tmp_path: Path) -> None:
     from multidrop.plant.loader import PlantError, load_plant
 
     path = tmp_path / "plant.toml"

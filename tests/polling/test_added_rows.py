@@ -198,7 +198,7 @@ def test_a_channel_is_not_computed_if_its_register_is_not_polled(
 
 @pytest.mark.long
 @patient
-def test_totals_start_at_0_if_their_file_is_damaged(port: str, tmp_path: Path) -> None:
+def test_the_totals_start_at_0_if_their_file_is_damaged(port: str, tmp_path: Path) -> None:
     for content in ("", "[", "[]", '{"pump-1.charge": {"totals": [[1e999]]}}'):
         (tmp_path / "totals.json").write_text(content)
         made = replace(plant(line(port, pump(CHARGE))), totals=tmp_path / "totals.json")

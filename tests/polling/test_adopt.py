@@ -99,7 +99,7 @@ OTHERS = (
 
 @pytest.mark.long
 @pytest.mark.parametrize("every", usually(None, 0.1, 0.08), ids=str)
-def test_adopting_other_lines_does_not_shift_requests_on_an_unchanged_line(every: float | None) -> None:
+def test_a_change_of_other_lines_does_not_delay_an_unchanged_line(every: float | None) -> None:
     """An unchanged line's requests are sent at exactly the same times as without a call of `adopt`."""
 
     def exchanges(*, adopts: bool) -> list[tuple[int, str, str]]:
@@ -120,7 +120,7 @@ def test_adopting_other_lines_does_not_shift_requests_on_an_unchanged_line(every
     assert beside[: len(alone)] == alone
 
 
-def test_adopting_an_equal_plant_keeps_drive_objects_and_ports() -> None:
+def test_a_change_to_an_equal_plant_keeps_drive_objects_and_ports() -> None:
     with clocked(hall(*pumps()), yard(*fans())) as made:
         made.run(2)
         before = made.poller.plant
@@ -133,7 +133,7 @@ def test_adopting_an_equal_plant_keeps_drive_objects_and_ports() -> None:
 
 
 @pytest.mark.slow
-def test_adopt_changes_rates_and_registers_without_reopening_the_port() -> None:
+def test_rates_and_registers_can_be_changed_without_reopening_the_port() -> None:
     with clocked(hall(*pumps())) as made:
         made.run(2)
         first, second = made.poller.bus("hall").drives
@@ -153,7 +153,7 @@ def test_adopt_changes_rates_and_registers_without_reopening_the_port() -> None:
 
 
 @pytest.mark.slow
-def test_adopt_adds_and_removes_drives_and_changes_their_addresses() -> None:
+def test_a_new_plant_adds_and_removes_drives_and_changes_addresses() -> None:
     with clocked(hall(*pumps())) as made:
         made.run(2)
         stays = made.poller.bus("hall").drives[0]
@@ -170,7 +170,7 @@ def test_adopt_adds_and_removes_drives_and_changes_their_addresses() -> None:
 
 
 @pytest.mark.slow
-def test_adopt_can_replace_a_drive_by_one_of_another_family() -> None:
+def test_a_drive_can_be_replaced_by_one_of_another_family() -> None:
     drives = [InnovertIBD(7, name="pump"), InvtCHE(7, name="pump")]
     registers = [drive.readings()[:4] for drive in drives]
     wires = {"port of hall": wire(drives[0], Toy(1))}
@@ -189,7 +189,7 @@ def test_adopt_can_replace_a_drive_by_one_of_another_family() -> None:
 
 
 @pytest.mark.slow
-def test_adopt_keeps_the_port_of_a_renamed_line_open() -> None:
+def test_the_port_of_a_renamed_line_stays_open() -> None:
     with clocked(hall(*pumps()), yard(*fans())) as made:
         made.run(2)
         names = replace(hall(*pumps()), name="yard"), replace(yard(*fans()), name="hall")
@@ -201,7 +201,7 @@ def test_adopt_keeps_the_port_of_a_renamed_line_open() -> None:
 
 
 @pytest.mark.long
-def test_adopt_adds_and_removes_lines() -> None:
+def test_a_new_plant_adds_and_removes_lines() -> None:
     with clocked(hall(*pumps())) as made:
         made.run(2)
         assert made.poller.adopt(plant(yard(*fans()))) == {}
@@ -214,7 +214,7 @@ def test_adopt_adds_and_removes_lines() -> None:
         assert sorted(made.opened) == ["port of hall", "port of hall", "port of yard"]
 
 
-def test_every_time_slot_before_a_line_is_removed_has_a_row() -> None:
+def test_every_poll_due_before_its_line_is_removed_has_a_row() -> None:
     with clocked(hall(*pumps()), yard(*fans())) as made:
         rows = made.run(2.05)
         made.poller.remove_line("yard")
@@ -290,7 +290,7 @@ def test_the_cost_of_adding_a_line_grows_linearly_with_the_lines() -> None:
     assert calls_to_add_one_to(24) < 2 * calls_to_add_one_to(12)
 
 
-def test_late_replies_are_still_expected_after_adopt_reopens_a_port() -> None:
+def test_late_replies_are_still_expected_after_a_new_plant_reopens_a_port() -> None:
     """The late reply may arrive after the port is reopened, so the bus must remember it."""
     wires = {"port of hall": wire(Toy(1))}
     with ClockedLines.of_lines(wires, plant(hall(toy("pump-1", 1), toy("gone", 5)))) as made:
@@ -325,7 +325,7 @@ def test_a_new_drive_expects_late_replies_of_the_drive_that_it_replaces() -> Non
 
 
 @pytest.mark.slow
-def test_adopt_reports_an_absent_port_and_opens_it_when_it_exists() -> None:
+def test_an_absent_port_of_a_new_plant_is_opened_when_it_exists() -> None:
     with clocked(hall(*pumps())) as made:
         made.run(1)
         del made.wires["port of yard"]
@@ -386,7 +386,7 @@ def broken() -> dict[str, tuple[Plant, str]]:
 
 @pytest.mark.long
 @table("mistake", broken())
-def test_adopting_an_invalid_plant_changes_nothing(mistake: str) -> None:
+def test_an_invalid_new_plant_changes_nothing(mistake: str) -> None:
     wrong, sentence = broken()[mistake]
     with clocked(hall(*pumps()), yard(*fans())) as made:
         made.run(2)
@@ -400,14 +400,14 @@ def test_adopting_an_invalid_plant_changes_nothing(mistake: str) -> None:
         assert sorted(made.opened) == ["port of hall", "port of yard"]
 
 
-def test_adopt_reports_all_mistakes_of_a_plant_together() -> None:
+def test_all_mistakes_of_a_new_plant_are_reported_together() -> None:
     pump, _ = pumps()
     with clocked(hall(*pumps())) as made, pytest.raises(PlantError) as found:
         made.poller.adopt(plant(hall(pump, toy("pump-1", 1)), hall(toy("v", 3))))
     assert len(found.value.mistakes) == 4
 
 
-def test_adopting_an_invalid_port_name_changes_nothing() -> None:
+def test_an_invalid_port_name_in_a_new_plant_changes_nothing() -> None:
     with clocked(hall(*pumps())) as made:
         made.run(1)
         with pytest.raises(NoSuchPort, match="it needs a host and a port number"):
@@ -423,7 +423,7 @@ def test_an_unopenable_audit_log_raises_and_changes_nothing() -> None:
         check_rates(made, pump_1=0.1)
 
 
-def test_adopting_drives_of_another_open_poller_raises() -> None:
+def test_a_plant_with_drives_of_another_open_poller_is_refused() -> None:
     with clocked(hall(*pumps())) as made:
         sentence = "it is on another bus: detach it there first, or create another drive object"
         with clocked(hall(*pumps())) as other, pytest.raises(PlantError, match=sentence):
@@ -431,7 +431,7 @@ def test_adopting_drives_of_another_open_poller_raises() -> None:
         assert list(made.poller.buses) == ["hall"]
 
 
-def test_adopt_refuses_more_drive_names_than_a_batch_can_number() -> None:
+def test_a_plant_with_too_many_new_drive_names_is_refused() -> None:
     with clocked(hall(*pumps())) as made:
         for number in range(65534):
             made.poller._lines.names.drives.number(f"gone-{number}")
@@ -441,7 +441,7 @@ def test_adopt_refuses_more_drive_names_than_a_batch_can_number() -> None:
         check_rates(made, pump_2=0.1)
 
 
-def test_adopt_raises_after_polling_has_ended() -> None:
+def test_the_plant_cannot_be_changed_after_polling_has_ended() -> None:
     poller = Poller(plant())
     poller.close()
     for change in (
@@ -453,7 +453,7 @@ def test_adopt_raises_after_polling_has_ended() -> None:
             change()
 
 
-def test_adopt_rejects_other_types() -> None:
+def test_an_object_that_is_not_a_plant_is_refused() -> None:
     poller = Poller(plant())
     with pytest.raises(TypeError, match=r"Poller takes a Plant or a plant file such as 'plant.toml', not 5"):
         poller.adopt(5)  # type: ignore[arg-type]

@@ -137,7 +137,7 @@ def test_motors_keep_running_when_their_line_is_removed(both: TwoLines) -> None:
     assert runs(both.fans[1])
 
 
-def test_with_stop_on_exit_a_drive_is_stopped_before_it_is_removed(both: TwoLines) -> None:
+def test_a_drive_is_stopped_before_it_is_removed_with_stop_on_exit(both: TwoLines) -> None:
     with Poller(plant(both.hall(), both.yard())) as poller:
         poller.stop_on_exit()
         for bus in poller.buses.values():
@@ -248,7 +248,7 @@ def waited_for(bus: Bus, monkeypatch: pytest.MonkeyPatch, drive: Drive | None = 
     return found
 
 
-def test_removing_a_line_waits_for_its_stop(both: TwoLines, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_line_is_removed_only_after_its_stop(both: TwoLines, monkeypatch: pytest.MonkeyPatch) -> None:
     with Poller(plant(both.hall(), both.yard())) as poller:
         bus = poller.bus("yard")
         bus.drives[0].start()
@@ -358,7 +358,7 @@ def test_two_concurrent_removals_remove_a_line_once(both: TwoLines) -> None:
         assert list(poller.buses) == ["hall"]
 
 
-def test_calls_on_removed_lines_and_drives_raise(both: TwoLines) -> None:
+def test_every_call_on_a_removed_line_or_drive_raises(both: TwoLines) -> None:
     with Poller(plant(both.hall(), both.yard())) as poller:
         pump_1, pump_2 = poller.bus("hall").drives
         fan, _ = poller.bus("yard").drives
@@ -405,7 +405,9 @@ def _is_asking(poller: Poller, of: PolledDrive) -> bool:
     return bus.is_asking(bus.peer(of.drive))
 
 
-def test_a_poller_closes_only_after_adopt_has_ended(both: TwoLines, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_poller_closes_only_after_a_change_of_plant_has_ended(
+    both: TwoLines, monkeypatch: pytest.MonkeyPatch
+) -> None:
     poller = Poller(plant(both.hall()))
     poller.__enter__()
     with Blocked() as opening:
@@ -417,7 +419,7 @@ def test_a_poller_closes_only_after_adopt_has_ended(both: TwoLines, monkeypatch:
     assert not any(bus.is_open for bus in poller.buses.values())
 
 
-def test_adopt_connects_to_several_servers_in_parallel(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_servers_of_a_new_plant_are_connected_in_parallel(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two calls of `create_connection` wait for each other. Closing never sleeps."""
     with TwoLines("socket://127.0.0.1:0") as both:
         lines = both.hall(), both.yard()
@@ -440,7 +442,9 @@ def test_adopt_connects_to_several_servers_in_parallel(monkeypatch: pytest.Monke
             until_sampled(poller, "fan-1")
 
 
-def test_adopt_opens_other_ports_beside_a_slow_one(both: TwoLines, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slow_port_does_not_delay_the_other_ports_of_a_new_plant(
+    both: TwoLines, monkeypatch: pytest.MonkeyPatch
+) -> None:
     nowhere = line("socket://127.0.0.1:1", quick("far", 1), name="far")
     found: dict[str, LineError] = {}
     with Poller(plant(both.hall())) as poller:
@@ -495,7 +499,7 @@ class Dawdling(dict[object, object]):
 
 
 @pytest.mark.slow
-def test_a_summary_during_adopt_shows_either_the_old_or_the_new_plant(both: TwoLines) -> None:
+def test_a_summary_during_a_change_shows_the_old_or_the_new_plant(both: TwoLines) -> None:
     with Poller(plant(both.hall())) as poller:
         (polled_line,) = poller._lines
         maker = polled_line._maker

@@ -1,4 +1,4 @@
-"""Batches: read row by row, as columns, by Arrow libraries, and in the wide form."""
+"""Batches: read row by row, as columns, by Arrow libraries, and as a wide table."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def test_pandas_reads_a_batch() -> None:
 
 
 @pytest.mark.parametrize("library", ["pandas", "numpy"])
-def test_constructors_of_pandas_and_numpy_raise_with_advice(library: str) -> None:
+def test_the_pandas_and_numpy_constructors_refuse_a_batch_with_advice(library: str) -> None:
     """The constructors of pandas and NumPy ignore Arrow's interface, and would read a batch row by row."""
     taker = pytest.importorskip(library, reason=f"needs {library}")
     take = taker.DataFrame if library == "pandas" else taker.asarray
@@ -153,7 +153,7 @@ def test_every_status_code_has_its_text() -> None:
     assert all(statuses)
 
 
-def test_columns_hold_all_rows_and_the_names_for_their_codes() -> None:
+def test_the_columns_hold_all_rows_and_the_names_for_their_codes() -> None:
     columns = example().columns()
     drives, registers, statuses = columns.drives, columns.registers, columns.statuses
     rows = [
@@ -168,7 +168,7 @@ def test_columns_hold_all_rows_and_the_names_for_their_codes() -> None:
     assert bytes(columns.valid) == bytes([sum(1 << at for at in samples)])
 
 
-def test_columns_have_the_documented_types() -> None:
+def test_the_columns_have_the_documented_types() -> None:
     columns = counting(20).columns()
     formats = {"time": "q", "monotonic_ns": "q", "uncertainty_ns": "q", "value": "d"}
     formats |= dict.fromkeys(("drive", "register", "status"), "H") | {"valid": "B"}
@@ -179,7 +179,7 @@ def test_columns_have_the_documented_types() -> None:
     assert numpy.asarray(columns.value)[:9].tolist() == list(range(9))
 
 
-def test_columns_outlive_their_batch() -> None:
+def test_the_columns_stay_valid_after_their_batch_is_deleted() -> None:
     """The core's queue does not reuse a chunk of rows while a view of that chunk exists."""
     queue = RowQueue()
     names = Names(["a"])
@@ -194,7 +194,7 @@ def test_columns_outlive_their_batch() -> None:
     assert [list(view) for view in kept] == [[at] for at in range(200)]
 
 
-def test_names_added_later_do_not_change_the_codes_of_earlier_names() -> None:
+def test_a_name_added_later_does_not_change_earlier_codes() -> None:
     names = Names(["a"])
     first = Batch(Columns(1), names, names).columns()
     assert names.number("b") == 1
@@ -338,7 +338,7 @@ SPEED = "pump-1.motor_speed"
 
 
 @pytest.mark.slow
-def test_to_pandas_returns_times_as_datetime64_in_utc() -> None:
+def test_pandas_gets_times_as_datetime64_in_utc() -> None:
     pytest.importorskip("pandas", reason="needs pandas")
     frame = example().to_pandas()
     assert list(frame.columns) == list(ROW_COLUMNS)
@@ -350,7 +350,7 @@ def test_to_pandas_returns_times_as_datetime64_in_utc() -> None:
 
 
 @pytest.mark.slow
-def test_to_polars_returns_times_as_datetime_in_utc() -> None:
+def test_polars_gets_times_as_datetime_in_utc() -> None:
     polars = pytest.importorskip("polars", reason="needs polars")
     frame = example().to_polars()
     assert frame.schema["time"] == polars.Datetime("ns", "UTC")

@@ -103,7 +103,7 @@ def test_a_drive_added_after_all_drives_were_removed_is_polled(port: str) -> Non
 
 
 @pytest.mark.slow
-def test_removing_a_silent_drive_does_not_disturb_other_drives(port: str) -> None:
+def test_the_removal_of_a_silent_drive_does_not_disturb_other_drives(port: str) -> None:
     with Poller(plant(line(port, pump(1), pump(3, "dead")))) as poller:
         seen = Seen(poller)
         until(lambda: "not asked: drive is silent" in (seen.of("dead") and ()) or len(seen.statuses) > 1)
@@ -138,7 +138,7 @@ def test_an_unpolled_drive_does_not_disturb_other_drives(port: str) -> None:
         assert seen.of("pump-3") == []
 
 
-def test_calls_of_a_detached_drive_raise_and_send_nothing(port: str) -> None:
+def test_every_call_of_a_detached_drive_raises_and_sends_nothing(port: str) -> None:
     with Bus(port) as bus:
         ours = bus.attach(Toy, address=1, name="pump-1")
         assert ours.read(CURRENT) == proof(Toy(1), CURRENT)
@@ -288,7 +288,7 @@ def only_line(made: ClockedLines) -> PolledLine:
     return line
 
 
-def test_set_rate_of_one_register_changes_no_other_rate(two: ClockedLines) -> None:
+def test_a_new_rate_of_one_register_changes_no_other_rate(two: ClockedLines) -> None:
     two.poller.set_rate("pump-1", "output_current", 1.0)
     two.run(1)  # until all queued requests have been sent
     counts = values(two.run(10))
@@ -327,8 +327,8 @@ def test_the_first_value_at_a_new_rate_is_read_immediately(two: ClockedLines) ->
     assert values(two.run(1))["pump-1", "fault"] == 1
 
 
-def test_registers_with_an_unchanged_rate_keep_their_time_slots() -> None:
-    """They keep them although the register with the new rate is no longer read in the same block."""
+def test_registers_with_an_unchanged_rate_are_still_polled_on_time() -> None:
+    """The register with the new rate is no longer read by the same request."""
     with clocked(polled(toy(), ALL, 0.1)) as made:
         begun = made.run(3)[0].monotonic_ns
         made.poller.set_rate("pump-1", "output_frequency", 0.25)
@@ -336,12 +336,12 @@ def test_registers_with_an_unchanged_rate_keep_their_time_slots() -> None:
     grid = [round((row.monotonic_ns - begun) / S, 4) % 0.1 for row in rows]
     assert max(min(late, 0.1 - late) for late in grid) < 0.02
     gaps = [later.monotonic_ns - row.monotonic_ns for row, later in pairwise(rows)]
-    assert max(gaps) < 0.12 * S  # no slot is skipped
+    assert max(gaps) < 0.12 * S  # no poll is skipped
     assert len(rows) in (29, 30, 31)
 
 
 @pytest.mark.long
-def test_changes_of_rates_attribute_no_value_to_another_register() -> None:
+def test_a_change_of_rates_attributes_no_value_to_another_register() -> None:
     """Every value is of the right register, and each register has rows after each change."""
     chance = random.Random(7)
     drives = [polled(toy(address), ALL, 0.05) for address in (1, 2)]
@@ -391,7 +391,7 @@ def test_memory_is_bounded_over_many_changes_of_rates() -> None:
     assert all(now <= then + 4 for now, then in zip(after, before, strict=True)), (before, after)
 
 
-def test_skipped_time_slots_stay_counted_after_a_change_of_the_rate() -> None:
+def test_skipped_polls_stay_counted_after_a_change_of_the_rate() -> None:
     with clocked(polled(toy(), ALL, 0.001)) as made:
         made.run(2)
         (before,) = (line["overrun_slots"] for line in made.poller.summary()["lines"].values())
@@ -482,12 +482,12 @@ def test_an_invalid_rate_changes_nothing(two: ClockedLines) -> None:
     assert set(values(two.run(10)).values()) <= {99, 100, 101}
 
 
-def test_set_rate_refuses_another_drive_object_of_the_same_name(two: ClockedLines) -> None:
+def test_a_rate_for_another_drive_object_of_the_same_name_is_refused(two: ClockedLines) -> None:
     with pytest.raises(ValueError, match="pump-1 is not polled here"):
         two.poller.set_rate(toy(1), None, 1.0)
 
 
-def test_set_rate_raises_after_polling_has_ended() -> None:
+def test_a_rate_cannot_be_set_after_polling_has_ended() -> None:
     poller = Poller(plant())
     poller.close()
     with pytest.raises(ValueError, match="polling has ended"):

@@ -150,7 +150,9 @@ def test_a_failing_line_is_retried_at_growing_intervals(
     assert delays[:6] == [0.005, 0.01, 0.02, 0.04, 0.08, 0.1]
 
 
-def test_requests_queued_when_a_line_failed_are_sent(two: Two, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_request_that_was_queued_when_its_line_failed_is_sent(
+    two: Two, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """If a line fails while it queues requests, the poller does not know how many requests are queued."""
     submit, repeat = Port.submit, Port.repeat
     left = 3
@@ -207,7 +209,9 @@ def failed(two: Two, monkeypatch: pytest.MonkeyPatch) -> Two:
     return two
 
 
-def test_calls_of_a_failed_poller_raise_polling_failed(failed: Two, caplog: pytest.LogCaptureFixture) -> None:
+def test_every_call_of_a_failed_poller_raises_polling_failed(
+    failed: Two, caplog: pytest.LogCaptureFixture
+) -> None:
     poller = failed.poller
     assert repr(poller).startswith("<Poller polling has ended on all lines: Ill: of this line;")
     rows: list[Row] = []
@@ -306,7 +310,9 @@ def test_a_failure_of_a_pyserial_bridge_counts_as_a_lost_port(
     until(lambda: "of the bridge" in caplog.text)
 
 
-def test_system_exit_in_a_log_handler_ends_no_logging(two: Two, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_system_exit_in_a_log_handler_does_not_end_the_logging(
+    two: Two, caplog: pytest.LogCaptureFixture
+) -> None:
     class Exiting(logging.Handler):
         def emit(self, record: logging.LogRecord) -> None:
             raise SystemExit
@@ -343,7 +349,7 @@ class Waiting:
 @pytest.mark.parametrize(
     "function", [wait, give, give_later, Waiting(), partial(wait), partial(partial(give))]
 )
-def test_on_batch_rejects_async_and_generator_functions(two: Two, function: Any) -> None:
+def test_an_async_or_generator_function_is_refused_by_on_batch(two: Two, function: Any) -> None:
     with pytest.raises(TypeError, match="is async or a generator: a call would not run it"):
         two.poller.on_batch(function)
 
@@ -407,7 +413,7 @@ def counted(poller: Poller) -> int:
     return int(summary["samples"]) + int(summary["misses"])
 
 
-def test_on_batch_gets_every_row_once_before_close_returns(poller: Poller) -> None:
+def test_the_on_batch_function_gets_every_row_before_close_returns(poller: Poller) -> None:
     rows: list[Row] = []
     threads: set[str] = set()
 
@@ -447,7 +453,9 @@ def test_a_slow_on_batch_function_does_not_delay_polling(poller: Poller) -> None
 
 
 @pytest.mark.slow
-def test_on_batch_errors_are_logged_and_raised_once(poller: Poller, caplog: pytest.LogCaptureFixture) -> None:
+def test_an_error_of_the_on_batch_function_is_logged_and_raised_once(
+    poller: Poller, caplog: pytest.LogCaptureFixture
+) -> None:
     calls: list[int] = []
 
     def fail(batch: Batch) -> None:

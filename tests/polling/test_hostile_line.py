@@ -140,7 +140,7 @@ def test_only_two_echoes_of_a_silent_delixi_drive_are_read_as_0() -> None:
 @pytest.mark.story
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", usually(*KINDS))
-def test_polling_without_rates_recovers_from_a_fault(kind: str) -> None:
+def test_a_line_polled_without_rates_recovers_from_a_fault(kind: str) -> None:
     """Without rates, the core repeats the bus cycle without the poller until a fault occurs."""
     story = Story(of_one_variant(LINES["innovert-ibd rtu"]), every=None)
     story.run_with_fault(KINDS[kind])
@@ -245,7 +245,7 @@ def test_all_family_variants_on_one_line_are_polled_at_real_baud_rates() -> None
         rows, summary = poll(path, drives, REAL_SECONDS)
     check(rows, drives, summary)
     assert {row.drive for row in rows if row.value is not None} == {each.drive.name for each in drives}
-    # Each slot of a register with a rate has a row or is counted as skipped, except the last slots.
+    # Each due poll of a register with a rate has a row or is counted as skipped, except the last ones.
     on_a_grid = {(each.drive.name, each.polls[-1].register.name) for each in drives}
     kept = sum(1 for row in rows if (row.drive, row.register) in on_a_grid)
     assert kept + summary["overrun_slots"] >= len(drives) * (REAL_SECONDS // EVERY - 2)

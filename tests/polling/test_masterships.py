@@ -307,7 +307,7 @@ def taken_of(poller: Poller, rows: list[Row]) -> list[Row]:
 
 
 @pytest.mark.long
-def test_adding_and_removing_a_line_does_not_interrupt_others(mastership: Mastership, far: Listener) -> None:
+def test_an_added_or_removed_line_does_not_interrupt_others(mastership: Mastership, far: Listener) -> None:
     hold(mastership)
     yard = line(far.url, quick("fan", 1, None), name="yard")
     with lines(0.02) as (_, (hall, _)), Poller(plant(hall), mastership=mastership) as poller:

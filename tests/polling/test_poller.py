@@ -137,7 +137,7 @@ def port(pump: SimulatedDrive) -> Iterator[str]:
 
 
 @pytest.mark.slow
-def test_requests_with_a_period_are_sent_in_their_time_slots_without_bursts(port: str) -> None:
+def test_periodic_requests_are_sent_on_time_and_without_bursts(port: str) -> None:
     periods = {"output_current": 0.02, "output_frequency": 0.05}
     polls = [polled(drive(), [Quick.registers[name]], every).polls for name, every in periods.items()]
     before_ns = clock.now_ns()
@@ -147,10 +147,10 @@ def test_requests_with_a_period_are_sent_in_their_time_slots_without_bursts(port
         mine = [row for row in polling.rows if row.register == name]
         # A set, because a late reply adds another row with the time of its request.
         sent = sorted({row.monotonic_ns for row in mine if row.status not in NOT_SENT})
-        # The n-th request is not sent before the n-th slot: no request is early.
+        # The n-th request is not sent before it is due.
         assert all(at >= before_ns + number * every * 1e9 for number, at in enumerate(sent))
     left_out = polling.poller.summary()["lines"]["line"]["overrun_slots"]
-    # Each slot until the last row has a row, or is counted as skipped.
+    # Each poll that was due before the last row has a row, or is counted as skipped.
     times = [row.monotonic_ns for row in polling.rows]
     polled_s = (max(times) - min(times)) / 1e9
     slots = sum((polled_s - 0.5) // every for every in periods.values())
@@ -186,7 +186,7 @@ def test_drives_with_equal_line_settings_are_polled_in_a_row(kinds: list[dict[st
     assert len(list(itertools.groupby(asked, lambda at: at % 2))) == 2
 
 
-def test_batches_yields_rows_for_the_given_seconds(port: str) -> None:
+def test_the_method_batches_yields_rows_for_the_given_seconds(port: str) -> None:
     with Poller(plant(line(port, polled(drive(), READINGS)))) as poller:
         rows: list[Row] = []
         while not any(row.register == "output_current" and row.status == "ok" for row in rows):
@@ -197,7 +197,7 @@ def test_batches_yields_rows_for_the_given_seconds(port: str) -> None:
         assert all(row.uncertainty_ns is not None and row.uncertainty_ns > 0 for row in samples)
 
 
-def test_iterating_before_the_with_block_raises_instead_of_waiting_forever(port: str) -> None:
+def test_a_loop_over_a_poller_raises_before_the_with_block(port: str) -> None:
     async def first(poller: Poller) -> None:
         async for _ in poller:
             break
@@ -210,7 +210,7 @@ def test_iterating_before_the_with_block_raises_instead_of_waiting_forever(port:
     assert list(poller) == []
 
 
-def test_leaving_a_loop_over_batches_early_is_allowed(port: str) -> None:
+def test_a_loop_over_batches_can_be_left_early(port: str) -> None:
     with Poller(plant(line(port, polled(drive(), READINGS)))) as poller:
         assert len(next(poller.batches())) > 0
 
@@ -365,7 +365,7 @@ def test_a_silence_that_is_too_short_for_the_drive_loses_values() -> None:
     polling.check("ok")
 
 
-def test_replies_at_9600_baud_are_read_without_early_requests(pump: SimulatedDrive) -> None:
+def test_no_request_is_sent_too_early_at_9600_baud(pump: SimulatedDrive) -> None:
     """At 9600 baud, the poller keeps the silences between frames, so the drive receives no early request."""
     slow = simulated(Slow(1, name="pump-1"))
     asked = polled(Slow(1, name="pump-1"), Slow.readings())
@@ -414,7 +414,7 @@ def test_a_lost_port_is_reopened_when_its_device_link_returns(tmp_path: Path) ->
 
 
 def queued_before_a_stop(hall: PolledLine) -> int:
-    """Reopen the port before the poller does, as a stop does. Return the number of slots still queued."""
+    """Reopen the port before the poller does, as a stop does. Return the number of polls still queued."""
     with hall._lock:  # keeps the poller's thread from refilling the queue
         core, noted, queued = hall.bus.line.queue, hall._queue._done, len(hall._queue.slots())
         assert core
@@ -521,7 +521,7 @@ def test_a_plant_without_lines_can_be_polled() -> None:
 
 
 @pytest.mark.parametrize("end", ["polled", "lost", "never entered"])
-def test_closing_a_poller_leaves_no_descriptor_or_thread(port: str, end: str) -> None:
+def test_a_closed_poller_leaves_no_descriptor_or_thread(port: str, end: str) -> None:
     Poller(plant(line(port, polled(drive(), ONE)))).close()  # opens descriptors that are created on first use
     before = descriptors(), threads()
     if end == "never entered":
@@ -583,7 +583,7 @@ def test_closing_a_poller_waits_for_exchanges_in_flight(
 def test_a_request_without_reply_when_polling_ends_has_a_row(
     responder: tuple[int, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A queued slot has a row only if it has already ended when polling ends."""
+    """A queued poll has a row only if its period has already ended when polling ends."""
     monkeypatch.setattr(line_set, "ENDING_NS", 10_000_000)
     master, path = responder
     short = polled(Patient(2, name="pump-2"), [Patient.fault], 0.0002)

@@ -39,7 +39,7 @@ def values(rows: list[Row]) -> dict[str, float]:
     return {row.register: row.value for row in rows if row.value is not None}
 
 
-def test_splitting_a_block_separates_no_registers_that_must_be_read_together() -> None:
+def test_registers_that_must_be_read_together_are_never_separated() -> None:
     class Kind(Drive):
         read_together = (("high", "low"),)
         a = reading(0)
@@ -114,7 +114,7 @@ def test_a_split_block_is_read_as_a_whole_once_it_is_accepted(monkeypatch: pytes
 
 
 @pytest.mark.slow
-def test_attempts_to_read_a_split_block_as_a_whole_add_no_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_retry_of_a_split_block_adds_no_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(refusals, "SET_ASIDE_NS", 1_000_000_000)
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive, most=12)
@@ -154,7 +154,7 @@ def test_a_drive_that_ignores_long_requests_is_not_polled_too_often() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("answered_s", [0, 3])
-def test_blocks_of_a_silent_drive_are_not_split(answered_s: int) -> None:
+def test_a_block_of_a_silent_drive_is_not_split(answered_s: int) -> None:
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive)
     sim.deaf_until = 0.0 if answered_s else float("inf")

@@ -90,7 +90,7 @@ def test_a_stop_reopens_a_lost_port_if_no_thread_can_be_started(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("threads", [0, 1])
-def test_adopt_opens_all_lines_even_if_few_threads_can_be_started(
+def test_all_new_lines_are_opened_even_if_few_threads_can_be_started(
     hall: Plant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, threads: int
 ) -> None:
     """If `adopt` failed here, running motors would get no stop."""
@@ -269,7 +269,7 @@ def test_a_server_that_closes_idle_connections_costs_no_value() -> None:
 
 
 @pytest.mark.long
-def test_values_are_missing_if_a_server_closes_each_connection_at_once() -> None:
+def test_all_values_are_missing_if_a_server_closes_each_connection_immediately() -> None:
     """Many devices close a new connection at once if they already serve as many clients as they can."""
     with server(lambda nth, address: False, idle_s=0.0) as port:
         drive = polled(Scattered(1, name="pump"), [Scattered.registers["near"]], 0.1)

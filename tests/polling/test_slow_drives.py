@@ -40,8 +40,8 @@ FIRST, LATER = 8, 30  # s; values are counted in the first 8 s and in the 30 s a
 BACK = 45  # s; time limit until dead drives are polled again after they get power
 
 
-def test_a_slot_skipped_in_advance_gets_its_row_only_when_it_is_due() -> None:
-    """The poller decides in advance which slots of a silent drive it skips."""
+def test_a_poll_skipped_in_advance_gets_its_row_only_when_due() -> None:
+    """The poller decides in advance which polls of a silent drive it skips."""
     toy = Toy(1, name="pump-1")
     silent = simulated(toy)
     silent.deaf_until = float("inf")
@@ -115,7 +115,9 @@ def test_silent_drives_hardly_slow_the_others_and_return_soon(dead: int, back_s:
 @pytest.mark.long
 @pytest.mark.story
 @pytest.mark.parametrize(("count", "dead", "every"), [(16, 5, None), (16, 1, 0.5), (31, 10, None)])
-def test_drives_dead_from_the_start_hardly_slow_others(count: int, dead: int, every: float | None) -> None:
+def test_drives_that_are_dead_from_the_start_hardly_slow_others(
+    count: int, dead: int, every: float | None
+) -> None:
     """Every third drive is dead, so that most answering drives are polled after a dead one."""
     gone = {3 * number + 1 for number in range(dead)}
 
@@ -170,7 +172,7 @@ def asked_together(rows: list[Row]) -> set[bool]:
 @pytest.mark.slow
 @table(("document", "truth"), [(SOON, LATE), (LATE, SOON)], ids=["later", "sooner"])
 @table("every", [None, 0.75], ids=["in turn", "at a rate"])
-def test_blocks_are_planned_again_if_the_response_delay_differs_from_the_manual(
+def test_requests_are_planned_again_if_the_response_delay_differs_from_the_manual(
     document: float, truth: float, every: float | None
 ) -> None:
     drive = Wide(1, name="pump-1")
@@ -189,10 +191,10 @@ def test_blocks_are_planned_again_if_the_response_delay_differs_from_the_manual(
         for name in NAMES:
             slots = [row.monotonic_ns for row in first + between + after if row.register == name]
             dues = {round((at - slots[0]) / (every * S)) for at in slots}
-            assert dues == set(range(len(dues)))  # each slot has exactly one row
+            assert dues == set(range(len(dues)))  # each poll has exactly one row
 
 
-def test_replanning_one_drive_keeps_the_polling_order() -> None:
+def test_a_new_plan_for_one_drive_keeps_the_polling_order() -> None:
     drives = [Wide(address, name=f"pump-{address}") for address in (1, 2, 3)]
     drives[1].response_delay = LATE
     sims = [SimulatedDrive(Wide(address), response_delay=SOON) for address in (1, 2, 3)]
@@ -273,7 +275,9 @@ def quick(address: int) -> tuple[Drive, Picky]:
 @pytest.mark.long
 @table("every", [None, 0.01, 0.5])
 @table("others", [0, 2])
-def test_registers_with_a_least_interval_are_polled_equally_often(every: float | None, others: int) -> None:
+def test_registers_of_a_drive_that_needs_pauses_are_polled_equally_often(
+    every: float | None, others: int
+) -> None:
     drive, sim = slow()
     rest = [quick(address) for address in range(2, 2 + others)]
     drives = [
@@ -331,7 +335,7 @@ def test_a_stop_is_the_first_request_after_the_drives_pause() -> None:
     assert sim.early == 0
 
 
-def test_single_reads_keep_the_least_interval_between_requests() -> None:
+def test_single_reads_keep_the_pause_between_requests() -> None:
     (drive, sim), (other, its_sim) = slow(), quick(2)
     with ClockedLines(ClockedWire([sim, its_sim], Faults()), [polled(other, other.readings())]) as clocked:
         bus = clocked.poller.bus("line")
@@ -350,7 +354,7 @@ def test_single_reads_keep_the_least_interval_between_requests() -> None:
     assert sim.early == 0
 
 
-def test_the_least_interval_extends_the_expiry_of_a_write() -> None:
+def test_the_pause_between_requests_extends_the_expiry_of_a_write() -> None:
     drive = family(1, least_interval=2.0)(1)
     SimulatedBus(Picky(drive)).attach(drive)
     patient = Call(drive, Latch().permit(), 1.0)

@@ -151,7 +151,7 @@ def path_of(monkeypatch: pytest.MonkeyPatch) -> PathOf:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "slow"), READS)
-def test_reads_over_a_slow_path_return_the_right_values(
+def test_a_read_over_a_slow_path_returns_the_right_value(
     name: str, slow: tuple[Callable[[float], Delay], float], path_of: PathOf
 ) -> None:
     """A client reads four registers of each of two drives in turn, and retries failed reads."""
@@ -163,7 +163,7 @@ def test_reads_over_a_slow_path_return_the_right_values(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "slow"), ASKED)
-def test_raw_reads_over_a_slow_path_return_the_right_values(
+def test_a_raw_read_over_a_slow_path_returns_the_right_value(
     name: str, slow: tuple[Callable[[float], Delay], float], path_of: PathOf
 ) -> None:
     """Raw reads alternate with similar reads of other addresses. No raw read is retried."""
@@ -353,7 +353,7 @@ def gateway_path_of(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPa
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "slow"), ON_TCP_PATHS)
-def test_reads_over_a_slow_gateway_return_the_right_values(
+def test_a_read_over_a_slow_gateway_returns_the_right_value(
     name: str, slow: tuple[Callable[[float], Delay], float], gateway_path_of: PathOf
 ) -> None:
     path, seconds = slow

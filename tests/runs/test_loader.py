@@ -19,7 +19,7 @@ from multidrop.runs.model import LimitWatch, length, timeline
 EEPROM = {"model": "delixi-modbus", "framing": "rtu", "poll": ["output_frequency"]}
 
 
-def test_lists_and_repetitions_in_a_test_file_become_planned_steps(tmp_path: Path) -> None:
+def test_each_list_and_repetition_in_a_test_file_becomes_planned_steps(tmp_path: Path) -> None:
     text = """
     [abort]
     limits = ["fan.output_current >= 30", "pump.fault != 0"]
@@ -141,7 +141,7 @@ def test_mistakes_are_listed_by_line_without_consequential_errors(tmp_path: Path
         assert part in sentence
 
 
-def test_loading_a_plant_file_as_a_test_suggests_multidrop_poll(tmp_path: Path) -> None:
+def test_a_plant_file_used_as_a_test_file_is_reported_with_advice(tmp_path: Path) -> None:
     plant = write_test(tmp_path, "").with_name("plant.toml")
     with pytest.raises(ValueError, match=r"plant\.toml: this is a plant file; poll .* `multidrop poll .*`"):
         load_test(plant)
@@ -195,7 +195,7 @@ def test_a_plant_with_a_drive_named_test_is_refused(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_error_for_a_test_that_is_too_fast_says_what_would_fit(
+def test_a_test_that_is_too_fast_is_reported_with_a_possible_speed(
     line: str, keys: dict[str, str], sentence: str, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     plan = load_test(write_test(tmp_path_factory.mktemp("misfit"), line, fan=CHE | keys))
@@ -310,7 +310,7 @@ def test_missing_values_of_a_fault_code_are_reported(watch: LimitWatch) -> None:
     assert watch.silent(5 * S) == "no value of pump.fault came for 3.0 s"
 
 
-def test_values_of_a_channel_do_not_hide_a_silent_drive(watch: LimitWatch) -> None:
+def test_a_drive_counts_as_silent_although_its_channel_has_values(watch: LimitWatch) -> None:
     watch.add([row("fan", "output_current", 1.0, 3.0), row("pump", "power_of_all", 1.0, 3.0)])
     assert watch.silent(3 * S) == "no value of pump came for 3.0 s"
 

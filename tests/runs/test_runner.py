@@ -49,7 +49,7 @@ SPEED = 5.0
 
 
 @pytest.mark.slow
-def test_steps_are_carried_out_in_order_and_recorded_with_their_phases(tmp_path: Path) -> None:
+def test_all_steps_are_carried_out_in_order_and_recorded_with_their_phases(tmp_path: Path) -> None:
     out, audit = tmp_path / "run.arrows", tmp_path / "audit.jsonl"
     with simulated_test(write_test(tmp_path), speed=SPEED) as (plan, (fan,)):
         result = TestRun(plan, audit=audit, speed=SPEED).run(out)
@@ -232,7 +232,7 @@ class HangingWriter:
 LIMIT = 'limits = ["fan.output_current > 30"]'
 
 
-def test_limits_abort_while_the_disk_hangs_and_all_rows_are_written_later(tmp_path: Path) -> None:
+def test_a_hanging_disk_prevents_no_abort_and_loses_no_row(tmp_path: Path) -> None:
     disk, poller = HangingWriter(), FixedPoller(1.0, 31.0)
     found = session(tmp_path, LIMIT, poller, writer=disk)
     found._mark("start")
@@ -521,7 +521,7 @@ class FarEnds:
             )
 
     def happen(self) -> None:
-        """Count requests from now on: the reason for the abort exists."""
+        """Record that the run now has a reason to abort; count requests from now on."""
         if self.cause is None:
             self.cause = {line: len(requests) for line, requests in self.requests.items()}
 

@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "names",
         metavar="NAME",
         nargs="*",
-        default=[],  # else argparse's error for a missing KIND would call NAME required too
+        default=[],  # without it, argparse's error for a missing KIND would demand a NAME too
         help="plant: your own families, as the plant file names them, such as meter.toml or fan.py:Fan; "
         "family: the CSV files that a family file may name",
     )
@@ -71,7 +71,7 @@ def _add(
 
 def _run_schema(arguments: argparse.Namespace) -> int:
     made = schema_of(arguments.kind, arguments.names)
-    print(json.dumps(made, indent=1))  # print_text would mask parts of URL patterns
+    print(json.dumps(made, indent=1))  # not `print_text`, which would mask parts of URL patterns
     return 0
 
 

@@ -124,7 +124,7 @@ class Monitor:
         self._has_left = False
         self._side_reader = SideReader(session.poller)
         self._how = how
-        self._trigger: Path | None = None  # the recording of the trigger whose curves are shown
+        self._trigger: Path | None = None  # recorded file whose curves are shown
 
     def show(self, seconds: float | None) -> None:
         """Draw and react to keys until the user quits, a signal comes, or `seconds` have passed."""

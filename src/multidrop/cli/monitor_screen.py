@@ -1,4 +1,4 @@
-"""The pictures of the monitor, as lines of text for a given width and height.
+"""Draw the screens of the monitor as lines of text, for a given width and height.
 
 Important states are shown by words and marks, not only by colours.
 """

@@ -219,9 +219,9 @@ def _setpoint(drive: Drive, hz: float) -> Write | None:
 
 
 def _rehearse(script: Script[Any]) -> None:
-    """Run the verb's script up to its first request, without a port.
+    """Check the first request of a command, without a port.
 
-    Raises if the family lacks or forbids the verb.
+    Raises Unsupported or ValueError if the drive lacks the command, or if it may not be sent.
     """
     step = next(script)
     if isinstance(step, Write):

@@ -5,8 +5,8 @@ period has one slot (a time interval in which it is carried out) in each period.
 the period and never drift. Among the started slots, the slot that ends first goes first. If there is time for
 all of them, jobs with equal line settings and silence are sent one after another. A slot that ends before its
 turn is counted and skipped for good. Then, until the line has caught up, the job that has waited longest goes
-first, so that each job gets a share. Jobs without a period take turns, one round after another, in the
-remaining time. They have a minimum share of the line. Silent drives get few requests: see `BackOff`.
+first, so that each job is carried out. Jobs without a period take turns, one round after another, in the
+remaining time. They have a minimum share of the line's time. Silent drives get few requests: see `BackOff`.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Job:
     kind: Hashable = None
     due_ns: int = 0
     taken_ns: int = 0
-    skipped: int = 0  # number of slots that passed without a request because the line was busy
+    skipped: int = 0  # number of polls that were skipped because the line was busy
     number: int = 0  # position in the bus cycle
 
     @property
@@ -61,7 +61,7 @@ class Turn(NamedTuple, Generic[J]):
 
     job: J
     not_before_ns: int
-    due_ns: int | None  # start of the slot; None for a job without a period
+    due_ns: int | None  # time at which the job was due; None for a job without a period
 
 
 # ---- silent drives ----
@@ -204,20 +204,20 @@ class Schedule(Generic[J]):
     def clear(self) -> None:
         """Forget all jobs and the health of their drives."""
         self.jobs: list[J] = []
-        # slots without a request because the drive is silent: job and start of the slot
+        # polls that were skipped because the drive is silent: the job, and the time at which it was due
         self.unasked: list[tuple[J, int]] = []
         self.back_off = BackOff(self._begin_pause)
         self._health: dict[int, Health] = self.back_off.health
-        self._waiting: list[tuple[int, int, J]] = []  # heap of (start of the slot, number, job)
-        self._begun: list[J] = []  # jobs whose slot has started but is not carried out yet
-        # earliest time of the next request, by drive; only for drives with a least interval
+        self._waiting: list[tuple[int, int, J]] = []  # heap of (due time, number, job)
+        self._begun: list[J] = []  # jobs that are due but not carried out yet
+        # earliest time of the next request, by drive; only for drives that need a pause between requests
         self._ready: dict[int, int] = {}
         self._held: list[J] = []  # jobs without a period that wait for the end of their drive's interval
         self._round: list[J] = []  # jobs without a period, in the order of polling
         self._next = 0  # index in `_round` of the next job
         # bus time that jobs without a period are entitled to; negative if they have used more than that
         self._owed_ns = -CREDIT_NS
-        self._is_late = False  # True from a skipped slot until no job is due
+        self._is_late = False  # True from a skipped poll until no job is due
         self._kind: Hashable = None  # line settings and silence of the job that was taken last
         self._number = 0
 
@@ -308,13 +308,13 @@ class Schedule(Generic[J]):
         return not self._ready or at_ns >= self._ready.get(job.drive, 0)
 
     def _next_ns(self, at_ns: int) -> int:
-        """Return the earliest future time at which a slot starts or a drive's least interval ends."""
+        """Return the earliest future time at which a job is due or a drive may get its next request."""
         times = [max(at_ns, self._waiting[0][0])] if self._waiting else []
         times += [ready_ns for ready_ns in self._ready.values() if ready_ns > at_ns]
         return min(times, default=NEVER_NS)
 
     def _begin_slots(self, by_ns: int) -> None:
-        """Start all slots that are due. Skip slots of drives that get no request now."""
+        """Add the jobs that are due to `_begun`. Skip those of drives that get no request now."""
         while self._waiting and self._waiting[0][0] <= by_ns:
             job = heapq.heappop(self._waiting)[2]
             if self.back_off.is_paused(job.drive, by_ns):
@@ -328,11 +328,11 @@ class Schedule(Generic[J]):
         self._await(job)
 
     def _due(self, at_ns: int) -> J | None:
-        """Choose the next of the jobs whose slots have started; return None if no job can be sent now.
+        """Choose the next of the jobs that are due; return None if no job can be sent now.
 
-        If slots were skipped, choose the job that was sent longest ago. Otherwise choose the job whose slot
-        ends first. If there is time for all of these jobs before this slot ends, prefer a job of the same
-        kind as the job that was chosen before.
+        If polls were skipped, choose the job that was sent longest ago. Otherwise choose the job whose
+        period ends first. If there is time for all due jobs before that, prefer a job of the same kind as the
+        job that was chosen before.
         """
         if self.back_off.has_pauses(at_ns):
             for job in [job for job in self._begun if self.back_off.is_paused(job.drive, at_ns)]:
@@ -385,11 +385,11 @@ class Schedule(Generic[J]):
         return not self.back_off.is_paused(job.drive, at_ns) and not self._health[job.drive].is_pending
 
     def _take(self, job: J, at_ns: int) -> Turn[J]:
-        """Return the next exchange of a job. Skip and count the job's slots that have already ended."""
+        """Return the next exchange of a job. Count and skip its polls whose period has already ended."""
         health = self._health[job.drive]
         health.is_pending = health.is_new
         ready_ns = self._ready.get(job.drive, 0)
-        if job.period_ns is None or health.pause_ns:  # a retry of a silent drive does not use a slot
+        if job.period_ns is None or health.pause_ns:  # a retry does not replace a periodic poll
             self._owed_ns = max(self._owed_ns - self._duration_ns(job), -CREDIT_NS)
             return Turn(job, max(health.late_until_ns, ready_ns), None)
         self._begun.remove(job)
@@ -428,14 +428,14 @@ class Schedule(Generic[J]):
             job.due_ns, job.taken_ns = turn.due_ns, 0
             self._await(job)
 
-    # ---- slots without a request ----
+    # ---- skipped polls ----
 
     def _begin_pause(self, drive: int, now_ns: int) -> None:
         """Add the drive's jobs without a period to `unasked`, so that each gets one row without a value."""
         self.unasked += [(job, now_ns) for job in self._round if job.drive == drive]
 
     def pass_slots(self, now_ns: int) -> list[tuple[J, int]]:
-        """Skip every slot that starts by `now_ns`. Return a job and a start time for each skipped slot."""
+        """Skip every poll that is due by `now_ns`. Return the job and the due time of each skipped poll."""
         while self._begun:
             self._await(self._begun.pop())
         passed = []

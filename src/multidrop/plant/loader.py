@@ -44,7 +44,8 @@ class PlantError(ValueError):
     """Raised for a plant file with mistakes; `mistakes` has a sentence for each, with place and correction.
 
     `right` is a plant with the drives that can still be stopped. Mistakes in `every`, `poll` and channels do
-    not prevent a stop; drives with other mistakes are left out. It is None if the file is not valid TOML.
+    not prevent a stop; drives with other mistakes are left out. If the file is not valid TOML, `right` is
+    None.
     """
 
     def __init__(self, mistakes: tuple[str, ...], right: Plant | None = None) -> None:
@@ -208,7 +209,7 @@ _NOT_ARGUMENTS = ("name", "model", "every", "poll", "channel")
 
 
 def _line(table: Any, place: TomlPlace) -> PlantLine | None:
-    """Return the line, without drives whose mistakes prevent a stop; None if the line has a mistake."""
+    """Return the line with the drives that can still be stopped; None if the line itself has a mistake."""
     before = len(place.config_errors)
     given = place.check(table, LINE_KEYS)
     name, port = given.get("name", ""), given.get("port", "")

@@ -39,7 +39,7 @@ _log = logging.getLogger("multidrop.polling")
 
 
 class AddedRow(NamedTuple):
-    """A row to be added, with codes in place of names; its fields are the core's columns."""
+    """A row to be added; its fields are the core's columns, with codes in place of names."""
 
     time: int
     sent: int
@@ -78,7 +78,7 @@ class AddedRows:
         self._drives: dict[str, ref[Drive]] = {}
         # For a name that another drive had before: the monotonic time of the new drive's first row.
         self._since_ns: dict[str, int] = {}  # by drive name
-        self._slot_since_ns: dict[int, int] = {}  # by slot
+        self._slot_since_ns: dict[int, int] = {}  # by input slot
         self._events: list[AddedRow] = []
         self._totals: TotalsFile | None = None
         # totals by channel name, including those of channels that are not computed now
@@ -165,7 +165,7 @@ class AddedRows:
         return Batch(JoinedColumns(columns, added), self._names.drives, self._names.registers)
 
     def _computed(self, batch: Batch) -> list[AddedRow]:
-        # boot time is read first: a pause between the two reads cannot make the difference too large
+        # The boot time is read first. So a pause between the two reads can only make the difference smaller.
         slept_ns = clock.boottime_ns() - clock.now_ns()
         added = [
             AddedRow(

@@ -104,7 +104,7 @@ class KeptLine:
         self.line = line
         self.wanted = wanted
         self.joining: list[PolledDrive] = []
-        self._repolled: list[PolledDrive] = []  # drives that stay, whose polled registers or rates change
+        self._repolled: list[PolledDrive] = []  # drives that stay, with other registers or rates
         left = list(line.polled)
         for polled in wanted.drives:
             description = _description(polled.drive)
@@ -128,7 +128,7 @@ class KeptLine:
         self.line.bus.part_with(self.leaving, [one for one in self.leaving if one.address not in taken])
 
     def let_leave(self, names: Collection[str]) -> None:
-        """Remove the drives that leave, and wait for the last exchange of each whose name is in `names`."""
+        """Remove the leaving drives; if a drive's name is in `names`, also wait for its last exchange."""
         for drive in self.leaving:
             self.line.remove(drive)
             self.line.forget(drive)

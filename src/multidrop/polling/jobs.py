@@ -84,7 +84,7 @@ class JobMaker:
         self._made: dict[tuple[Drive, Block, int | None], PolledJob] = {}
         # Jobs that read a block at different rates share its layout, because the layout counts the refusals.
         self._rows: dict[tuple[Drive, Block], RowLayout] = {}
-        self._skipped = 0  # number of polls that were skipped by jobs which are forgotten now
+        self._skipped = 0  # number of skipped polls of jobs that were forgotten
 
     def plan(self, polled: PolledDrive, delay: float) -> PlannedJobs:
         """Plan the requests that poll a drive, for a response delay of `delay` s; return their jobs.
@@ -147,7 +147,7 @@ class JobMaker:
 
     @property
     def skipped(self) -> int:
-        """Number of slots that were skipped because the line was busy."""
+        """Number of polls that were skipped because the line was busy."""
         return self._skipped + sum(job.skipped for job in self._made.values())
 
 

@@ -330,7 +330,6 @@ class PolledLine:
         with self._lock:
             self.started_ns = clock.now_ns()
             self.bus.reset_statistics()
-            # not all drives of the bus, because some may not be polled
             polled = [polled.drive for polled in self.polled]
             for drive in in_order(polled, self.switching):
                 self._schedule_jobs(drive, self.started_ns)
@@ -338,7 +337,7 @@ class PolledLine:
         self._row_queue.call(self.number)
 
     def is_steady(self, now_ns: int) -> bool:
-        """Return True while the core repeats the bus cycle by itself, so that `tend` need not be called."""
+        """Return True while the C core repeats the bus cycle, so that `tend` need not be called."""
         return self._queue.is_repeating and now_ns - self._learnt_ns < RELEARN_NS
 
     def is_well(self, now_ns: int) -> bool:
@@ -509,7 +508,7 @@ class PolledLine:
     def _regain(self, now_ns: int) -> None:
         """Reopen the port in a thread; until that succeeds, add a row without a value for each due poll.
 
-        The first attempt adds no such rows: if it succeeds, polling continues in the same slot.
+        The first attempt adds no such rows: if it succeeds, polling continues without a gap.
         """
         if now_ns < self._reopen_ns or self._reopening.is_under_way:
             return
@@ -575,7 +574,7 @@ class PolledLine:
 
 
 def _over(slots: list[Slot], ended_ns: int) -> list[Slot]:
-    """Return the slots that end by `ended_ns`; the values of later slots do not count as missed."""
+    """Return the polls whose period ends by `ended_ns`. Later polls do not count as missed."""
     return [(job, due_ns) for job, due_ns in slots if due_ns + (job.period_ns or 0) <= ended_ns]
 
 

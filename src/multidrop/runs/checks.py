@@ -81,7 +81,7 @@ def check_frequency(drive: Drive, hz: float) -> None:
     check_worn(drive, "steps")
     if isinstance(first, Write):
         value = first.register.decode(raw_count(drive, first.register, first.value))
-        # only rules that need no reads from the drive; the run checks all
+        # Rules that need reads from the drive are not checked here, but by the run itself.
         next(conditions(drive, first.register, value), None)
 
 
@@ -154,7 +154,7 @@ def silence_of(plan: RunPlan) -> float:
 
 
 def misfits(plan: RunPlan) -> list[str]:
-    """Return a sentence for each part of the test that is too fast for its line, with a value that fits."""
+    """Return a sentence for each step and time that is too short for its line, with a possible value."""
     found = list(dict.fromkeys(_misfits(plan)))
     least = CYCLES * longest_pause(plan)
     if silence_of(plan) < least:

@@ -100,7 +100,7 @@ class TestRun:
         self._phases = [*dict.fromkeys([*(step.name for step in self.plan.steps), STOP])]
 
     def misfits(self) -> list[str]:
-        """Return a sentence for each time in the test that is too short for its line, and a longer time."""
+        """Return a sentence for each step and time that is too short for its line, with a possible value."""
         return misfits(self.plan)
 
     @property
