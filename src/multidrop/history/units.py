@@ -95,8 +95,8 @@ class OtherColumn(NamedTuple):
 class UnitHistory:
     """The newest unit of each series, and its earlier units.
 
-    The averages in `Buckets` leave out values in earlier units. `History.read` returns such values in a
-    separate column, such as "load [A]". `series` None means all series that the segments describe.
+    The averages in `Buckets` leave out values in earlier units. `History.read` returns such values with
+    another register name, such as "load [A]". `series` None means all series that the segments describe.
     """
 
     def __init__(self, known: Mapping[int, FileUnits], series: Iterable[Series] | None = None) -> None:
@@ -134,7 +134,7 @@ class UnitHistory:
         return [number for number in numbers if number not in self._known]
 
     def other_columns(self, number: int) -> list[OtherColumn]:
-        """Return the columns for those values of this segment that are in an earlier unit."""
+        """Return the register names for those values of this segment that are in an earlier unit."""
         known = self._known.get(number, {})
         return [
             OtherColumn(series, None if len(known[series]) == 1 else unit.text, column)

@@ -1,4 +1,4 @@
-"""Draw a recording's values: curves, lanes of states, and marks for faults and missed values."""
+"""Draw a recording's values: curves, rows of states (lanes), and marks for faults and missed values."""
 
 from __future__ import annotations
 
@@ -326,7 +326,7 @@ MOST_TEXTS = 50  # limit of labels with the same name in one lane
 
 @dataclass(frozen=True, eq=False)
 class Lane:
-    """The successive states of a drive's register, or of one of its bits, with their times."""
+    """A row of bars in a plot: the successive states of a drive's register, or of one of its bits."""
 
     drive: str
     title: str

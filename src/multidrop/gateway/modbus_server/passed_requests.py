@@ -108,7 +108,7 @@ class LineShare:
         if asked in self._waiting:
             self._waiting.remove(asked)
 
-    # ---- turns ----
+    # ---- sending the requests one after the other ----
 
     def _step(self) -> None:
         """Start the next request now, or later if the clients' requests have used up their bus time."""

@@ -34,7 +34,7 @@ MOST_KNOWN = 8192  # limit of the cached values; all drives of a family share th
 _MOST_EXACT = 1 << 53  # a float64 represents every whole number up to this one
 _FUNCTIONS = {Carrier.BIT: (1, 2), Carrier.WORD: (3, 4)}
 COMMON_LENGTH = 16  # number of words in the common block, which is the same for every drive
-# offsets in the common block, in words
+# places in the common block: number of words before the value
 STATE, FAULT, FREQUENCY, CURRENT, SETPOINT, AGE, STOP = 0, 1, 2, 4, 6, 8, 10
 STATES = {"unknown": 0, "stands": 1, "runs": 2, "fault": 3, "silent": 4}
 NO_FAULT, FAULT_WITHOUT_NUMBER, FAULT_UNKNOWN = 0, 0xFFFE, 0xFFFF

@@ -268,7 +268,7 @@ class _Protocol(OPCUAProtocol):
             self.transport.abort()
 
     async def _process_one_msg(self, header: Any, buf: Any) -> bool:
-        await asyncio.sleep(0)  # let other clients have their turns, after one message of this client
+        await asyncio.sleep(0)  # process messages of other clients before this client's next one
         return bool(await super()._process_one_msg(header, buf))
 
 
