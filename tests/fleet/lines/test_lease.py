@@ -668,7 +668,7 @@ async def test_a_gateways_new_session_waits_if_another_gateway_ended_the_previou
 
 
 async def test_a_session_with_only_one_expired_lease_record_is_not_ended() -> None:
-    """If its stale record were ended, the gateway could not renew it for the rest of the session."""
+    """If its expired record were ended, the gateway could not renew it for the rest of the session."""
     trial, lease = await begun()
     observer = trial.observer()
     for _ in range(20):

@@ -73,7 +73,7 @@ class Trial:
             await asyncio.sleep(0.001)
 
     async def let_the_first_lag(self) -> None:
-        """Renew all lease records late but the one on the home server of the line's first bucket."""
+        """Renew all lease records except the one on the server of the line's first bucket."""
         self.clock.pass_s(1.001)
         for path, name in enumerate(names.OWNERS):
             if name != self.buckets[0].name:

@@ -348,7 +348,7 @@ async def test_no_line_changes_its_master_when_a_server_dies(fleet: Cluster) -> 
 
 @pytest.mark.slow
 @pytest.mark.long
-async def test_sessions_without_a_third_lease_record_are_given_up_one_after_another(
+async def test_sessions_with_only_two_lease_records_are_replaced_one_after_another(
     fleet: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One more dead server would end all sessions with two lease records at once."""

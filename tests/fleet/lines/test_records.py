@@ -232,11 +232,11 @@ async def test_real_servers_return_the_newest_records_of_many_lines(one: Cluster
         assert len(await follower.look()) == 0
 
 
-# ---- moves of lines: a former master is reported only if its record was read ----
+# ---- changes of lines' masters: a former master is reported only if its record was read ----
 
 
 def told(*moves: Move) -> list[tuple[str | None, str]]:
-    """Return the former and new master of each move that is shown after these reports."""
+    """Return the former and the new master in each change that is listed after these reports."""
     found = Moves()
     found.add(moves)
     return [(move.before, move.after) for move in found.newest(100)]
@@ -282,7 +282,7 @@ def test_a_change_of_masters_is_read_back_unchanged_from_json() -> None:
 
 def test_only_the_newest_changes_of_masters_are_kept() -> None:
     moves = Moves(most=10)
-    # in descending order: buckets are read independently, so older moves may be added later
+    # in descending order: buckets are read independently, so older changes may be added later
     for turn in range(1000, 0, -1):
         moves.add([move(turn, None, "gw-1", f"line-{turn}")])
     assert [one.turn for one in moves.newest(10)] == list(range(1000, 990, -1))

@@ -1,4 +1,4 @@
-"""Repeated reads, and hand-overs of buckets' leadership, with fake servers in simulated time."""
+"""Repeated reads, and changes of buckets' leaders, with fake servers in simulated time."""
 
 from __future__ import annotations
 
@@ -225,7 +225,7 @@ async def test_lost_reads_are_repeated_soon_if_answers_were_fast() -> None:
     assert loop.time() - begun == pytest.approx(0.11)
 
 
-# ---- raft terms of the lease buckets: which are handed over while a server is silent, with fake servers ----
+# ---- lease buckets: their leaders change while a server is silent; with fake servers ----
 
 
 SERVERS = ("n1", "n2", "n3")
@@ -242,7 +242,7 @@ class Servers:
         self.silent: set[str] = set()
         self.unheard_ns = 0  # ns since a leader last received a message from a silent server; 0: never
         self.lagging: set[str] = set()
-        self.stuck: set[str] = set()  # buckets that have no leader after a hand-over
+        self.stuck: set[str] = set()  # buckets that have no leader after their leader has stepped down
         self.under_way = 0
         self.now = 0.0
         self.found = LeaseTerms(lambda: self.now)
@@ -275,7 +275,7 @@ class Servers:
         return {"cluster": {"leader": leader, "replicas": peers}}
 
     async def pass_s(self, seconds: int) -> None:
-        """Let this time pass, and hand over the buckets that are due once per second."""
+        """Let this time pass. Once per second, change the leaders that are due."""
         for _ in range(seconds):
             clusters = await led_clusters(PATH)
             await self.found.keep_ahead(PATH, clusters)
@@ -312,7 +312,7 @@ async def test_buckets_change_their_leaders_before_a_silent_servers_next_electio
         for bucket in names.LEASES[:2]:
             assert servers.terms[bucket] > 1 + second // 4
             assert servers.leaders[bucket] in ("n1", "n2")
-    assert servers.terms[names.LEASES[2]] == 1  # its leader is silent, so it cannot be handed over
+    assert servers.terms[names.LEASES[2]] == 1  # its leader is silent, so it cannot step down
     assert HAND_OVER_S < ASKS_S
 
 

@@ -163,7 +163,7 @@ class LineKeeper:
             self._start(lines, self._owners.claim({line: claims[line] for line in lines}))
 
     def reconcile(self) -> None:
-        """Close lines that other gateways own now, open own lines, and release closed lines that must move.
+        """Close lines that others own now, open own lines, and release closed lines that others should take.
 
         If a line should stay with this gateway after its release was sent, claim it again, because the
         release may have been stored.

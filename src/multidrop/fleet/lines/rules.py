@@ -155,7 +155,7 @@ def owner_by(records: LineRecords) -> Record | None:
 def turn_of(records: LineRecords) -> int:
     """Return how often the line was claimed or released so far; 0 if it never had a master.
 
-    Each record contains this number, as it was when the record was written; the highest one is the present.
+    Each record contains this number as of the time when it was written. The highest one is the newest.
     """
     turn = 0
     for record in records.values():
