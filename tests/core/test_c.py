@@ -46,7 +46,7 @@ def test_the_c_tests_of_rows_pass(build: Callable[..., None]) -> None:
 
 
 @pytest.mark.slow
-def test_utc_offset_is_read_for_each_batch_of_rows(build: Callable[..., None]) -> None:
+def test_the_utc_offset_is_read_for_each_batch_of_rows(build: Callable[..., None]) -> None:
     build("test_row_queue", "row_queue", "columns", "body", "frame")
 
 

@@ -88,7 +88,7 @@ NUMBERS = [
 
 
 @table(("wire", "data", "value"), NUMBERS)
-def test_raw_value_decodes_each_number_format(wire: int, data: str, value: float) -> None:
+def test_each_number_format_is_decoded_to_its_raw_value(wire: int, data: str, value: float) -> None:
     assert raw_value(bytes.fromhex(data), 0, wire) == value
 
 
@@ -167,7 +167,7 @@ def test_a_reply_gives_one_row_for_each_register_of_its_block() -> None:
 
 
 @table(("raw", "divisor"), [(3, 10), (7, 100), (5000, 100), (65535, 1000), (1, 3)])
-def test_scaled_value_is_the_float_nearest_to_the_exact_result(raw: int, divisor: int) -> None:
+def test_a_scaled_value_is_the_float_nearest_to_the_exact_result(raw: int, divisor: int) -> None:
     """Three steps of 0.1 give 0.3, not 0.30000000000000004."""
     columns = Columns(1)
     assert add_rows(columns, RowLayout(0, [Field(0, NumberFormat.U16, 0, 1, divisor)]), reply(raw), 0)

@@ -251,7 +251,7 @@ def test_a_late_request_is_sent_if_the_next_time_slot_is_not_due_yet(port: Port)
     assert rows.of("status", 1) == [0]
 
 
-def test_repeat_repeats_exchanges_until_they_are_replaced(port: Port, rows: Rows) -> None:
+def test_repeated_exchanges_are_sent_until_they_are_replaced(port: Port, rows: Rows) -> None:
     port.repeat([read(0), read(1), read(2)])
     assert port.repeating
     assert rows.of("value", 30)[:30] == [0, 1, 2] * 10
@@ -263,7 +263,7 @@ def test_repeat_repeats_exchanges_until_they_are_replaced(port: Port, rows: Rows
     assert status_of(port.carry_out(read(9))) == 0
 
 
-def test_the_next_of_the_replaced_exchanges_is_returned_by_repeat(port: Port, rows: Rows) -> None:
+def test_the_next_exchange_is_reported_when_repeated_exchanges_are_replaced(port: Port, rows: Rows) -> None:
     port.repeat([read(0), read(1), read(2)])
     rows.of("value", 20)
     following = port.repeat([])
@@ -315,7 +315,7 @@ def test_a_waiting_client_wakes_when_a_drive_fails_or_recovers(drive: Drive) -> 
             assert row_queue.await_calls(60) == [17]
 
 
-def test_await_calls_returns_when_a_drive_refuses_and_when_a_port_is_lost() -> None:
+def test_a_waiting_client_wakes_on_a_refusal_or_a_lost_port() -> None:
     with opened() as (port, far):
         row_queue = RowQueue()
         port.report_to(row_queue, 3)
@@ -422,7 +422,7 @@ def test_an_urgent_exchange_is_sent_before_the_queue(port: Port) -> None:
     assert pending(port) == 1
 
 
-def test_carry_out_returns_the_values_of_the_reply(drive: Drive) -> None:
+def test_the_result_of_an_exchange_has_the_values_of_its_reply(drive: Drive) -> None:
     lacking = Extra(invalid=((0xFFFF, 8),))
     tenths, eight = (Field(0, NumberFormat.U16, 0, 1, 10, extra) for extra in (None, lacking))
     values = RowLayout(0, [tenths, eight])
@@ -805,7 +805,7 @@ def test_closing_a_port_wakes_the_threads_that_wait_for_it(drive: Drive) -> None
     assert found == [Failure.LINE_LOST]
 
 
-def test_is_asking_is_true_for_peers_of_queued_repeated_and_urgent_exchanges() -> None:
+def test_a_drive_counts_as_asked_while_an_exchange_with_it_is_pending() -> None:
     """`is_asking` is true while a drive's exchanges wait or are in flight, but not for another drive."""
     with opened(room=4) as (port, far):
         queued, repeated, other = (read(1, timeout=0.02) for _ in range(3))

@@ -375,7 +375,7 @@ print("and here it works:", Bus.__name__)
 
 
 @pytest.mark.slow
-def test_importing_in_a_sub_interpreter_fails_and_in_the_main_interpreter_works() -> None:
+def test_an_import_fails_in_a_sub_interpreter_but_not_in_the_main_one() -> None:
     done = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, check=True)
     refused = (
         "multidrop works in a process's main interpreter only, and this is a sub-interpreter: "

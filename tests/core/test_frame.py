@@ -109,7 +109,7 @@ def test_a_frame_misprinted_in_a_manual_has_the_expected_fault() -> None:
         assert parse(printed, printed.frame) == (printed.says, None)
 
 
-def test_part_of_a_frame_is_parsed_as_incomplete() -> None:
+def test_a_part_of_a_frame_is_parsed_as_incomplete() -> None:
     for printed in GOOD_REQUESTS + GOOD_REPLIES:
         for length in range(len(printed.frame)):
             assert parse(printed, printed.frame[:length]) == (FrameFault.INCOMPLETE, None)
@@ -340,7 +340,7 @@ def test_a_request_with_a_field_out_of_bounds_raises(message: Message) -> None:
         exchange(RTU, message)
 
 
-def test_address_247_is_accepted_and_248_raises() -> None:
+def test_an_address_of_247_is_accepted_and_248_is_refused() -> None:
     reply = Message(247, 0x03, data=words(7))
     assert build_reply(RTU, reply) == checksums.rtu("F7 03 02 00 07")
     with pytest.raises(ValueError, match="out of bounds for a rtu frame"):
@@ -444,7 +444,7 @@ def test_lrc_equals_published_checksums(data: bytes, checksum: int) -> None:
         (bytes.fromhex("01 07 01 F4 00 00 13 88"), 0x98),
     ],
 )
-def test_delixis_checksum_equals_printed_checksums(data: bytes, checksum: int) -> None:
+def test_the_delixi_checksum_equals_those_in_its_manual(data: bytes, checksum: int) -> None:
     assert sum8(data, len(data)) == checksum
 
 
@@ -479,7 +479,7 @@ def test_every_single_bit_error_is_detected(data: bytes, more: st.DataObject) ->
 
 @settings(deadline=None)
 @given(frames, st.data())
-def test_crc_detects_every_burst_of_up_to_16_bits(data: bytes, more: st.DataObject) -> None:
+def test_a_crc_detects_every_burst_of_up_to_16_bits(data: bytes, more: st.DataObject) -> None:
     burst = more.draw(st.integers(1, 0xFFFF))
     at = more.draw(st.integers(0, max(0, 8 * len(data) - 16)))
     wrong = int.from_bytes(data, "little") ^ burst << at

@@ -80,7 +80,7 @@ def test_a_mastership_is_valid_until_its_deadline() -> None:
     assert (mastership.until_ns, mastership.holds) == (0, False)
 
 
-def test_extending_to_an_earlier_time_keeps_the_deadline() -> None:
+def test_a_deadline_is_never_moved_to_an_earlier_time() -> None:
     mastership = Mastership()
     later = now_ns() + 200 * S
     mastership.extend(later)

@@ -408,7 +408,7 @@ def test_a_request_of_another_framing_is_not_sent_on_a_tcp_port(line: LineDriver
     assert (serial.want, serial.completion.result) == ("done", FrameFault.BAD_REQUEST)
 
 
-def test_memory_is_bounded_under_endless_foreign_frames(line: LineDriver, drive: Peer) -> None:
+def test_memory_stays_limited_while_endless_foreign_frames_arrive(line: LineDriver, drive: Peer) -> None:
     transaction = ask(line, drive)
     for foreign in (transaction ^ 1, transaction):
         line.receive(tcp(foreign, bytes([9]) + bytes(250)) * 50)

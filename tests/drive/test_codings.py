@@ -363,7 +363,7 @@ def test_a_read_raises_an_error_if_a_raw_count_is_invalid() -> None:
     st.sampled_from([-3, -1, 1, 4]),
     st.data(),
 )
-def test_value_is_multiplied_by_the_power_of_ten_in_its_scale_register(
+def test_a_value_is_multiplied_by_the_power_in_its_scale_register(
     number_format: NumberFormat, step: float, power: int, distance: int, data: st.DataObject
 ) -> None:
     raw = data.draw(counts(number_format))

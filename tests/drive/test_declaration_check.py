@@ -97,7 +97,7 @@ WRONG: dict[str, dict[str, Any]] = {
 
 
 @table("mistake", WRONG)
-def test_mistake_in_a_register_is_reported_with_the_registers_name(mistake: str) -> None:
+def test_a_mistake_in_a_register_is_reported_with_its_name(mistake: str) -> None:
     (sentence,) = mistakes_in(speed=setting(5, "rpm", **WRONG[mistake]))
     assert sentence.startswith(f"speed: {mistake}")
 
@@ -130,7 +130,7 @@ PARTS: dict[str, dict[str, Any]] = {
 
 
 @table("mistake", PARTS)
-def test_mistake_in_a_read_only_register_is_reported(mistake: str) -> None:
+def test_a_mistake_in_a_read_only_register_is_reported(mistake: str) -> None:
     details = dict(PARTS[mistake])
     (sentence,) = mistakes_in(level=reading(5, details.pop("what", ""), **details))
     assert sentence.startswith(f"level: {mistake}")
@@ -185,7 +185,7 @@ SCALED: dict[str, dict[str, Register[Any]]] = {
 
 
 @table("mistake", SCALED)
-def test_scale_register_too_far_away_for_one_request_is_reported(mistake: str) -> None:
+def test_a_scale_register_too_far_away_for_one_request_is_reported(mistake: str) -> None:
     (sentence,) = mistakes_in(level=reading(10, scale_register="power"), **SCALED[mistake])
     assert sentence.startswith(f"level: {mistake}")
 
@@ -200,7 +200,7 @@ def test_register_with_a_scale_register_must_be_a_read_only_number() -> None:
     assert sentence == "level: a register with a scale register has neither names nor an offset"
 
 
-def test_limit_of_registers_in_one_read_includes_the_scale_register() -> None:
+def test_the_limit_of_registers_in_one_read_includes_the_scale_register() -> None:
     registers = {
         "most_registers": {HOLDING: 2},
         "level": reading(5, scale_register="power"),
@@ -211,7 +211,7 @@ def test_limit_of_registers_in_one_read_includes_the_scale_register() -> None:
         type("Fan", (Drive,), registers)
 
 
-def test_subclass_that_replaces_a_scale_register_is_reported() -> None:
+def test_a_subclass_that_replaces_a_scale_register_is_reported() -> None:
     first = declare(
         level=reading(5, scale_register="power"), power=reading(6, number_format=NumberFormat.I16)
     )
@@ -220,7 +220,7 @@ def test_subclass_that_replaces_a_scale_register_is_reported() -> None:
     assert first.registers["level"].reach == range(5, 7)
 
 
-def test_word_and_ranges_of_its_bits_may_be_declared_at_one_address() -> None:
+def test_a_word_and_parts_of_it_may_be_declared_at_one_address() -> None:
     fan = declare(
         status=setting(5), fault=reading(5, part=(0, 7)), runs=reading(5, part=(8, 8)), speed=reading(6)
     )
@@ -409,7 +409,7 @@ def test_verb_method_without_the_verb_decorator_is_reported(name: str) -> None:
     declare(control=control, **{name: verb(script)})
 
 
-def test_mistake_in_a_subclass_of_a_built_in_family_is_reported() -> None:
+def test_a_mistake_in_a_subclass_of_a_built_in_family_is_reported() -> None:
     with pytest.raises(DeclarationError, match=r"^Ours\.stop: without the decorator @verb"):
         type("Ours", (InnovertIBD,), {"stop": lambda self: None})
 

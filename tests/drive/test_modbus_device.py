@@ -101,7 +101,7 @@ def test_one_number_is_written_with_function_10h_if_multiple_is_true(meter: BusA
     assert [request.function for request, _ in line.frames] == [16, 3, 15, 1]
 
 
-def test_mask_write_changes_only_the_bits_that_are_0_in_the_and_mask(meter: BusAndDevice) -> None:
+def test_a_mask_write_changes_only_bits_that_its_first_mask_clears(meter: BusAndDevice) -> None:
     line, device = meter
     held = ["12 34"]
     answers = {0x16: "07 16 00 05 FF F0 00 04", 3: "07 03 02 "}
@@ -118,7 +118,7 @@ def test_mask_write_changes_only_the_bits_that_are_0_in_the_and_mask(meter: BusA
         device.mask_holding(5, 65536, 0, confirm=True)
 
 
-def test_mask_write_is_unconfirmed_if_the_register_cannot_be_read(meter: BusAndDevice) -> None:
+def test_a_mask_write_is_unconfirmed_if_the_register_cannot_be_read(meter: BusAndDevice) -> None:
     line, device = meter
     answers = {0x16: "07 16 00 05 FF F0 00 04", 3: "07 83 02"}
     line.answers = lambda request: rtu(answers[request.function])
@@ -136,7 +136,7 @@ def test_device_identification_in_two_replies_is_returned_whole(meter: BusAndDev
     assert [request.data.hex() for request, _ in line.frames] == ["0e0100", "0e0101"]
 
 
-def test_write_that_modbus_device_cannot_read_back_is_unconfirmed(meter: BusAndDevice) -> None:
+def test_a_write_that_cannot_be_read_back_is_unconfirmed(meter: BusAndDevice) -> None:
     """The reply to a write is a copy of the request, so it may be an RS-485 adapter's echo."""
     line, device = meter
     line.loses = lambda request: request.function == 3
@@ -144,7 +144,7 @@ def test_write_that_modbus_device_cannot_read_back_is_unconfirmed(meter: BusAndD
         device.write_holding(5, [7], confirm=True)
 
 
-def test_write_that_reads_back_another_number_raises_not_verified(
+def test_a_write_raises_an_error_if_another_number_is_read_back(
     meter: BusAndDevice, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     line, device = meter
@@ -173,7 +173,7 @@ def test_written_number_that_does_not_fit_its_format_is_refused(
     assert line.frames == []
 
 
-def test_modbus_device_raises_drive_exception_for_a_refused_address(meter: BusAndDevice) -> None:
+def test_a_modbus_device_raises_an_error_for_a_refused_address(meter: BusAndDevice) -> None:
     with pytest.raises(DriveException, match="illegal address"):
         meter[1].read_holding(5000)
 
@@ -245,14 +245,14 @@ def test_declared_coils_and_discrete_inputs_are_returned_as_bool(metered: BusAnd
     assert line.sims[0]["lamp"] == 1
 
 
-def test_setting_is_written_by_its_name(metered: BusAndTank) -> None:
+def test_a_setting_is_written_by_its_name(metered: BusAndTank) -> None:
     line, tank = metered
     assert tank.write("limit", 6.5) == tank.read(tank.limit) == line.sims[0]["limit"] == 6.5
     with pytest.raises(ValueError, match="has no register 'limits'; did you mean limit"):
         tank.write("limits", 6.5)
 
 
-def test_drive_without_a_bus_raises_not_attached() -> None:
+def test_a_drive_without_a_bus_raises_an_error() -> None:
     pump = InnovertIBD(1, name="pump-1")
     sentence = r"^pump-1 is not attached to a bus: use bus\.attach\(\.\.\.\)$"
     for call in (

@@ -151,7 +151,7 @@ def test_half_float_is_formatted_as_its_shortest_decimal(capsys: pytest.CaptureF
         Meter.f16.encode(65520)
 
 
-def test_limit_between_two_float32_values_can_be_written(attached: Any) -> None:
+def test_a_limit_between_two_float32_values_can_be_written(attached: Any) -> None:
     _, meter, _ = attached
     assert meter.write(Meter.narrow, 0.1) == pytest.approx(0.1)
     with pytest.raises(WriteForbidden, match=r"narrow = 0\.10001 is outside 0 to 0\.1 V"):
@@ -222,7 +222,7 @@ def test_single_register_is_written_by_function_16_if_its_table_requires_it(atta
     assert line.frames[-2][0].function == 0x0F
 
 
-def test_step_of_a_register_may_be_negative(attached: Any) -> None:
+def test_the_step_of_a_register_may_be_negative(attached: Any) -> None:
     _, meter, sim = attached
     assert meter.write(Meter.downwards, -5.0) == -5.0 == sim["downwards"]
     assert Meter.downwards.format(Meter.downwards.decode(0.0)) == "0.0 V"
@@ -235,5 +235,5 @@ def test_step_of_a_register_may_be_negative(attached: Any) -> None:
 @table(
     ("step", "decimals"), [(1, 0), (0.1, 1), (0.01, 2), (100, 0), (1e-7, 7), (-0.05, 2), (2.5, 1), (1e6, 0)]
 )
-def test_number_of_decimals_follows_from_the_registers_step(step: float, decimals: int) -> None:
+def test_the_number_of_decimals_follows_from_the_registers_step(step: float, decimals: int) -> None:
     assert reading(1, "V", step=step).decimals == decimals

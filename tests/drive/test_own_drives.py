@@ -83,7 +83,7 @@ def written(line: SimulatedBus) -> list[str]:
     return [frame[:17] for frame in line.written]
 
 
-def test_write_to_a_setting_of_a_users_drive_needs_no_confirmation() -> None:
+def test_a_write_to_a_setting_of_a_users_drive_needs_no_confirmation() -> None:
     line = SimulatedBus(simulated(Fan(1)))
     fan = line.attach(Fan(1))
     assert fan.write(fan.frequency, 25.0) == 25.0
@@ -92,7 +92,7 @@ def test_write_to_a_setting_of_a_users_drive_needs_no_confirmation() -> None:
 
 @table("confirmed", [0, 1])
 @table("word", Word)
-def test_plain_write_to_a_command_register_is_refused_by_default(confirmed: int, word: Word) -> None:
+def test_a_plain_write_to_a_command_register_is_refused_by_default(confirmed: int, word: Word) -> None:
     line = SimulatedBus(simulated(Pump(1)))
     pump = line.attach(Pump(1, name="pump", confirmed=confirmed))
     with pytest.raises(WriteForbidden) as refusal:
@@ -120,7 +120,7 @@ def test_error_for_a_missing_verb_names_the_method_to_declare() -> None:
     assert line.frames == []
 
 
-def test_write_of_a_raw_count_declared_harmless_needs_no_confirmation() -> None:
+def test_a_write_of_a_harmless_raw_count_needs_no_confirmation() -> None:
     class Stoppable(Pump):
         """A drive whose control word has a stop that is declared harmless."""
 
@@ -135,7 +135,7 @@ def test_write_of_a_raw_count_declared_harmless_needs_no_confirmation() -> None:
 
 
 @pytest.mark.parametrize("name", ["start", "set_frequency", "target"])
-def test_start_of_a_drive_without_identify_needs_confirmation(name: str) -> None:
+def test_a_start_needs_confirmation_if_the_drive_cannot_be_identified(name: str) -> None:
     def command_it(line: SimulatedBus, pump: Pump) -> None:
         acts = {
             "start": pump.start,
@@ -159,7 +159,7 @@ def test_start_of_a_drive_without_identify_needs_confirmation(name: str) -> None
 
 
 @pytest.mark.parametrize("name", ["start_staggered", "ramp", "run_at"])
-def test_ramps_and_combined_verbs_need_confirmation_too(name: str) -> None:
+def test_frequency_ramps_and_combined_verbs_need_confirmation_too(name: str) -> None:
     class Combined(Pump):
         """A drive with a verb that combines two others."""
 
@@ -191,7 +191,7 @@ def test_ramps_and_combined_verbs_need_confirmation_too(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["stop", "coast", "stop_all"])
-def test_stop_of_a_drive_without_identify_needs_no_confirmation(name: str) -> None:
+def test_a_stop_needs_no_confirmation_even_without_identification(name: str) -> None:
     line = SimulatedBus(simulated(Pump(1)))
     pump = line.attach(Pump(1))
     getattr(line.bus if name == "stop_all" else pump, name)()
@@ -210,7 +210,7 @@ def acknowledged(request: Message) -> bytes | None:
     return bytes.fromhex("01 86 05 82 63") if request.function == 6 else None  # checksum computed by pymodbus
 
 
-def test_write_that_is_answered_with_exception_05_is_unconfirmed() -> None:
+def test_a_write_that_is_answered_with_exception_05_is_unconfirmed() -> None:
     """Exception 05 means: accepted and being processed (application protocol V1.1b3, section 7)."""
     line = SimulatedBus(simulated(Known(1)))
     drive = line.attach(Known(1))
@@ -233,7 +233,7 @@ def test_exception_05_is_a_refusal_if_the_family_gives_it_another_meaning() -> N
         drive.start()
 
 
-def test_setting_can_be_declared_to_move_the_motor() -> None:
+def test_a_setting_can_be_declared_to_move_the_motor() -> None:
     class Readable(Drive):
         """A drive whose control word can be read."""
 

@@ -244,7 +244,7 @@ class Noting(Drive):
         return STANDS if self.zeros > 1 else RUNS
 
 
-def test_state_is_computed_only_once_for_equal_register_values() -> None:
+def test_a_state_is_computed_only_once_for_equal_register_values() -> None:
     Counting.looks.clear()
     reader = StateReader(Counting(1))
     for temperature in range(5):
@@ -257,7 +257,7 @@ def test_state_is_computed_only_once_for_equal_register_values() -> None:
     assert Counting.looks[-1] == 25.0
 
 
-def test_state_is_computed_again_for_a_register_value_of_nan() -> None:
+def test_a_state_is_computed_again_for_a_register_value_of_nan() -> None:
     Counting.looks.clear()
     reader = StateReader(Counting(1))
     assert [reader.state({"speed": math.nan}) for _ in range(2)] == [RUNS, RUNS]
@@ -281,13 +281,15 @@ def test_a_state_is_always_recomputed_if_the_method_sets_attributes() -> None:
         ("delixi-modbus", {"output_frequency": 25.0}, None),
     ],
 )
-def test_status_word_shows_a_fault(model: str, values: dict[str, float], condition: Condition | None) -> None:
+def test_a_status_word_shows_a_fault(
+    model: str, values: dict[str, float], condition: Condition | None
+) -> None:
     found = StateReader(MODELS[model](1)).state(values)
     assert (found and found.condition) == condition
     assert found is None or found.fault is None
 
 
-def test_fault_gets_its_name_once_the_fault_code_is_read() -> None:
+def test_a_fault_gets_its_name_when_the_fault_code_is_read() -> None:
     reader = StateReader(MODELS["invt-che"](1))
     assert reader.state({"status": 4.0}) == State(Condition.FAULT)
     assert reader.state({"status": 4.0}) == State(Condition.FAULT)
@@ -371,7 +373,7 @@ def test_identity_check_of_a_drive_can_read_a_text_register(maker: str) -> None:
     assert (line.written != []) == (maker == "ABB")
 
 
-def test_scan_reads_text_registers_to_identify_families() -> None:
+def test_a_scan_reads_text_registers_to_identify_families() -> None:
     sim = SimulatedDrive(Known(1))
     sim["maker"] = "ABB"
 
@@ -383,7 +385,7 @@ def test_scan_reads_text_registers_to_identify_families() -> None:
     assert _read(Known(1), Known.maker, ask) == "ABB"
 
 
-def test_polling_a_text_or_reading_another_familys_text_raises_an_error() -> None:
+def test_a_text_register_cannot_be_polled_or_read_from_another_family() -> None:
     class Other(Drive):
         """Another family with a text register at the same address."""
 
@@ -509,7 +511,7 @@ def test_a_unit_or_an_enumeration_can_be_a_keyword_argument() -> None:
     assert reading(0x10, values=IntEnum("Mode", "SLOW")).values is not None
 
 
-def test_text_with_one_character_per_register_is_in_the_low_bytes() -> None:
+def test_a_text_with_one_character_per_register_is_in_the_low_bytes() -> None:
     version = text(250, 5, order="B")
     assert version.decode(bytes.fromhex("0034 002E 0031 0000 0041")) == "4.1"
     assert version.decode(bytes.fromhex("FF34 FF2E FF31 FF38 FF20")) == "4.18"

@@ -82,7 +82,7 @@ def test_decimal_address_among_hex_addresses_is_reported_as_ambiguous(tmp_path: 
     assert "b: it cannot be read:" in omissions(device)[0]
 
 
-def test_unit_of_a_coil_in_a_csv_table_is_left_out_and_reported(tmp_path: Path) -> None:
+def test_a_unit_of_a_coil_in_a_csv_table_is_reported(tmp_path: Path) -> None:
     device = row(tmp_path, "address,type,table,unit", "5,uint16,coil,V")
     assert entries(device)["a"] == {"at": 5, "table": "coil"}
     assert found(device) == ["its type, unit and scale were left out: a coil is a bit"]
@@ -108,7 +108,7 @@ def test_unit_of_a_coil_in_a_csv_table_is_left_out_and_reported(tmp_path: Path) 
         ("scale", "x/10", None, "only its count is read: its scale 'x/10' or offset '' is not a number"),
     ],
 )
-def test_scale_column_with_several_meanings_is_reported(
+def test_a_scale_column_with_several_meanings_is_reported(
     tmp_path: Path, header: str, cell: str, step: float | None, gap: str
 ) -> None:
     device = row(tmp_path, f"address,type,{header}", f"0x10,uint16,{cell}")
@@ -116,7 +116,7 @@ def test_scale_column_with_several_meanings_is_reported(
     assert found(device) == ([gap] if gap else [])
 
 
-def test_column_decimal_of_an_emqx_neuron_table_is_a_factor(tmp_path: Path) -> None:
+def test_a_column_named_decimal_in_a_neuron_table_is_a_factor(tmp_path: Path) -> None:
     header = "address,attribute,type,decimal,precision,bias"
     device = row(tmp_path, header, "1!400001,Read Subscribe,UINT16,2,3,-40")
     assert entries(device)["a"] == {"at": 0, "step": 2, "offset": -40}
@@ -124,19 +124,19 @@ def test_column_decimal_of_an_emqx_neuron_table_is_a_factor(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("one", ["1", "1.0", "1,0", "1.000"])
-def test_scale_of_one_in_a_csv_table_does_not_hide_a_divisor(tmp_path: Path, one: str) -> None:
+def test_a_scale_of_one_in_a_csv_table_does_not_hide_a_divisor(tmp_path: Path, one: str) -> None:
     device = only(tmp_path, "t.csv", f"name;address;type;scale;divisor\na;0x10;uint16;{one};10\n")
     assert (entries(device)["a"], found(device)) == ({"at": 16, "step": 0.1}, [])
 
 
-def test_second_scale_column_of_a_csv_table_is_reported(tmp_path: Path) -> None:
+def test_a_second_scale_column_of_a_csv_table_is_reported(tmp_path: Path) -> None:
     device = row(tmp_path, "address,type,scale,gain", "0x10,uint16,0.1,10")
     assert found(device) == ["its gain 10 was not carried over beside its scale"]
     device = row(tmp_path, "address,type,data type", "0x10,uint16,int32")
     assert found(device) == ["the column data type was not carried over"]
 
 
-def test_order_of_offset_and_scale_in_a_csv_table_is_reported(tmp_path: Path) -> None:
+def test_the_order_of_offset_and_scale_in_a_csv_table_is_reported(tmp_path: Path) -> None:
     device = row(tmp_path, "address,type,scale,offset", "0x10,uint16,0.1,-40")
     assert found(device) == ["its offset -40 was taken as added after the step"]
 
@@ -219,7 +219,7 @@ def test_an_unknown_or_writable_access_in_a_csv_table_is_reported(
 
 
 @table("word", ["W", "WO", "Write", "write only", "Write-only"])
-def test_write_only_register_of_a_csv_table_is_reported_as_not_imported(tmp_path: Path, word: str) -> None:
+def test_a_write_only_register_of_a_csv_table_is_not_imported(tmp_path: Path, word: str) -> None:
     with pytest.raises(ValueError, match="a: is only written: a command is never imported"):
         row(tmp_path, "address,type,access", f"0x10,uint16,{word}")
 

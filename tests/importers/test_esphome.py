@@ -66,7 +66,7 @@ def test_unsupported_esphome_filters_are_reported(tmp_path: Path, keys: str, gap
     assert gaps(entity(tmp_path, keys), "a") == [gap]
 
 
-def test_multiply_of_an_esphome_number_becomes_a_divisor(tmp_path: Path) -> None:
+def test_the_factor_of_an_esphome_number_becomes_a_divisor(tmp_path: Path) -> None:
     """ESPHome multiplies values by `multiply` when it writes them, so a read divides by it."""
     assert entries(entity(tmp_path, "multiply: 10", "number"))["a"] == {"at": 5, "step": 0.1}
 

@@ -436,7 +436,7 @@ def test_devices_with_the_same_address_on_two_hubs_stay_separate(run: Run, tmp_p
     assert (status, "amp = " in out) == (0, True)
 
 
-def test_import_command_writes_a_family_file_and_a_plant_file(run: Run, tmp_path: Path) -> None:
+def test_the_import_command_writes_a_family_file_and_a_plant_file(run: Run, tmp_path: Path) -> None:
     source, family, plant = (tmp_path / name for name in ("c.csv", "meter.toml", "plant.toml"))
     source.write_text(MODPOLL)
     status, out, err = run("import", source, "--out", family, "--plant", plant)
@@ -455,7 +455,7 @@ def test_imported_device_with_only_text_registers_gets_no_plant_file(run: Run, t
     assert not family.exists()
 
 
-def test_import_command_asks_which_of_several_devices_to_import(run: Run, tmp_path: Path) -> None:
+def test_the_import_command_asks_which_of_several_devices_to_import(run: Run, tmp_path: Path) -> None:
     source = tmp_path / "telegraf.conf"
     source.write_text(TELEGRAF)
     status, _, err = run("import", source)

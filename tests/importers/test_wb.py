@@ -248,7 +248,7 @@ def test_invalid_wb_mqtt_serial_document_raises_value_error_with_the_reason(
         only(tmp_path, "w.json", document)
 
 
-def test_import_error_names_the_file(tmp_path: Path) -> None:
+def test_an_import_error_contains_the_name_of_the_file(tmp_path: Path) -> None:
     (tmp_path / "w.json").write_text("{}")
     with pytest.raises(ValueError, match=re.escape(str(tmp_path / "w.json"))):
         read_devices(tmp_path / "w.json")

@@ -415,13 +415,13 @@ def toy(simulated: SimulatedBus) -> Drive:
     return toy
 
 
-def test_read_raw_sends_and_parses_the_standards_example(simulated: SimulatedBus, toy: Drive) -> None:
+def test_a_raw_read_matches_the_example_in_the_standard(simulated: SimulatedBus, toy: Drive) -> None:
     """The request is that of the application protocol V1.1b3, 6.3; its CRC was calculated separately."""
     assert toy.read_raw(3, 1, 2) == bytes.fromhex("007B 0096")
     assert [frame for _, frame in simulated.frames] == ["07 03 00 01 00 02 95 AD"]
 
 
-def test_read_raw_is_not_treated_as_a_write(simulated: SimulatedBus, toy: Drive, tmp_path: Path) -> None:
+def test_a_raw_read_is_not_treated_as_a_write(simulated: SimulatedBus, toy: Drive, tmp_path: Path) -> None:
     """The read is not audited, retried or reported as unconfirmed, and no identity check precedes it."""
     simulated.loses = lambda request: True
     with pytest.raises(NoReply):
@@ -436,7 +436,7 @@ def test_an_exception_reply_to_a_raw_read_raises_an_error(simulated: SimulatedBu
     assert refusal.value.code == 2
 
 
-def test_read_raw_raises_expired_if_it_cannot_start_in_time(simulated: SimulatedBus, toy: Drive) -> None:
+def test_a_raw_read_expires_if_it_cannot_start_in_time(simulated: SimulatedBus, toy: Drive) -> None:
     simulated.queue_time = 0.3
     with pytest.raises(Expired, match=r"a read of 2 from 1 by function 03H was not sent: .* within 0.2 s"):
         toy.read_raw(3, 1, 2, expiry=0.2)
@@ -444,7 +444,7 @@ def test_read_raw_raises_expired_if_it_cannot_start_in_time(simulated: Simulated
     assert toy.read_raw(3, 1, 2, expiry=0.4) == bytes.fromhex("007B 0096")
 
 
-def test_read_raw_waits_for_late_replies_only_until_it_expires(
+def test_a_raw_read_waits_for_late_replies_only_until_it_expires(
     monkeypatch: pytest.MonkeyPatch, simulated: SimulatedBus, toy: Drive
 ) -> None:
     found = completed(int(Failure.LATE_ANSWER_DUE), Message(0, 0), b"", at_ns=0)
@@ -502,7 +502,7 @@ def test_a_raw_read_with_a_count_that_is_not_a_number_raises(
 
 
 @pytest.mark.parametrize("function", [1, 2, 3, 4])
-def test_send_raw_rejects_read_functions(simulated: SimulatedBus, toy: Drive, function: int) -> None:
+def test_a_raw_send_rejects_functions_that_read(simulated: SimulatedBus, toy: Drive, function: int) -> None:
     """A read sent as a write would wait so long that a late reply to an earlier read could be accepted."""
     with pytest.raises(
         ValueError, match=rf"{function:02X}H is a read.*call drive.read_raw\({function}, 80, 2\)"
@@ -511,7 +511,7 @@ def test_send_raw_rejects_read_functions(simulated: SimulatedBus, toy: Drive, fu
     assert simulated.frames == []
 
 
-def test_read_raw_respects_the_familys_limits() -> None:
+def test_a_raw_read_respects_the_familys_limits() -> None:
     _, native, _ = one(DelixiNative(1))
     with pytest.raises(ValueError, match="speaks Delixi's own protocol"):
         native.read_raw(3, 1, 1)
@@ -524,7 +524,7 @@ def test_read_raw_respects_the_familys_limits() -> None:
 
 
 @pytest.mark.slow
-def test_read_raw_works_on_a_polled_line() -> None:
+def test_a_raw_read_works_on_a_polled_line() -> None:
     """Even on a busy computer, neither the poller nor the raw read accepts a reply to the other's request."""
     drive = polled(Toy(1), [Toy.output_frequency, Toy.mystery])
     expected = proofs(drive)

@@ -190,7 +190,7 @@ def test_an_rfc2217_port_is_polled(server: SerialServer) -> None:
 
 @pytest.mark.slow
 @pyserials_own
-def test_drives_with_different_settings_on_an_rfc2217_port_raise(server: SerialServer) -> None:
+def test_drives_with_different_settings_are_refused_on_an_rfc2217_port(server: SerialServer) -> None:
     slow, fast = Toy(1, baudrate=9600), Toy(2, baudrate=19200)
     with pytest.raises(LineError, match=r"cannot switch its settings between two drives$"):
         Poller(plant(line(server.url, polled(slow, [Toy.status]), polled(fast, [Toy.status]))))
@@ -407,7 +407,7 @@ def test_closing_a_port_waits_for_the_exchanges_of_another_thread(monkeypatch: p
         assert not ours.end()
 
 
-def test_reading_through_a_closed_bus_raises_that_it_is_closed() -> None:
+def test_a_read_through_a_closed_bus_raises_an_error() -> None:
     with Simulator([wire()]) as sim:
         with Bus(sim.wires[0].path) as bus:
             toy = bus.attach(Toy, 1)

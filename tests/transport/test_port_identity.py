@@ -84,7 +84,7 @@ def sysfs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Sysfs:
         ("devices/pnp0/00:05", "", "", None),  # ttyS0
     ],
 )
-def test_adapter_of_returns_the_usb_socket_and_the_serial_number(
+def test_an_adapter_is_identified_by_usb_socket_and_serial_number(
     tmp_path: Path, device: str, serial: str, port_number: str, adapter: USBAdapter | None
 ) -> None:
     with pytest.MonkeyPatch.context() as monkeypatch:
@@ -213,7 +213,7 @@ def test_a_new_pseudo_terminal_with_a_used_number_is_not_opened(tmp_path: Path, 
             assert found.is_lost
 
 
-def test_lasting_name_returns_the_link_with_the_adapters_serial_number(
+def test_the_lasting_name_of_a_port_has_the_adapters_serial_number(
     tmp_path: Path, sysfs: Sysfs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     by_id, names = tmp_path / "by-id", {}
@@ -286,7 +286,9 @@ def test_a_port_that_leads_to_another_line_is_not_polled_and_gets_no_stop(
         ("socket://10.0.0.7:4001", errno.ETIMEDOUT, os.strerror(errno.ETIMEDOUT)),
     ],
 )
-def test_why_lost_distinguishes_unplugged_stalled_and_hung_up_ports(port: str, error: int, why: str) -> None:
+def test_the_reason_of_a_loss_distinguishes_unplugged_stalled_and_hung_up_ports(
+    port: str, error: int, why: str
+) -> None:
     assert why_lost(port, error) == why
 
 

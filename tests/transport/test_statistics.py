@@ -177,7 +177,7 @@ def line_of(seconds: float, overruns: int | None = None, **drives: Counters) -> 
     return line_statistics(seconds, drives, overruns)
 
 
-def test_since_returns_the_difference_between_two_statistics() -> None:
+def test_the_statistics_of_a_time_span_are_a_difference_of_two_readings() -> None:
     one = line_of(10, 5, pump=Counters(sent=100, ideal_ns=4 * 10**9, missed=Counter({10: 3})))
     two = line_of(
         12,
@@ -249,7 +249,7 @@ def test_a_poller_counts_its_rows_by_status(toy: SimulatedDrive) -> None:
 
 
 @pytest.mark.usefixtures("_patient")
-def test_reset_statistics_resets_renamed_and_replaced_drives_too(toy: SimulatedDrive) -> None:
+def test_a_reset_of_statistics_includes_renamed_and_replaced_drives(toy: SimulatedDrive) -> None:
     """Otherwise a renamed drive would keep earlier counts, and a new drive could have negative counts."""
     others = [simulated(Toy(address, name=f"toy-{address}")) for address in (2, 3)]
     with Simulator([Wire([toy, *others], unpaced=True)]) as simulator, Bus(simulator.wires[0].path) as bus:

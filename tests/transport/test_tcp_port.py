@@ -124,7 +124,9 @@ def test_an_attached_drive_uses_the_framing_of_its_port(port: str) -> None:
         (DelixiNative(1), "does not speak Modbus, and a tcp:// port such as tcp://.* carries nothing else"),
     ],
 )
-def test_another_framing_on_a_tcp_port_raises_one_sentence(port: str, drive: Drive, sentence: str) -> None:
+def test_another_framing_on_a_tcp_port_is_refused_in_one_sentence(
+    port: str, drive: Drive, sentence: str
+) -> None:
     with Bus(port) as bus, pytest.raises(ValueError, match=sentence):
         bus.attach(drive)
 
@@ -279,7 +281,7 @@ def test_the_error_for_a_silent_port_names_the_other_protocol() -> None:
                     drive.read(drive.output_current)
 
 
-def test_exception_0b_of_a_gateway_raises_no_reply() -> None:
+def test_an_exception_0b_of_a_gateway_counts_as_a_missing_reply() -> None:
     """The gateway answers each request with exception 0BH and the request's transaction id."""
 
     def serve(connection: socket.socket) -> None:

@@ -175,7 +175,7 @@ class ImportedRegister:
     lacks: str = ""
     is_read: bool = True
     is_written: bool = False
-    of_writes: dict[str, Any] = field(default_factory=dict)  # keys that it would need to be written
+    of_writes: dict[str, Any] = field(default_factory=dict)  # further keys for a declaration that allows writes
 
     def note_write(self, *, is_written: bool = True) -> None:
         """Record whether the program that made the file writes the register; if it does, add a gap."""
@@ -184,7 +184,7 @@ class ImportedRegister:
             self.gaps.append(WRITTEN)
 
     def put_names(self, key: str, pairs: Mapping[Any, Any]) -> None:
-        """Add names of the register's values or bits. The number of invalid names is added to `gaps`.
+        """Add names of the register's values or bits. If names are invalid, add their number to `gaps`.
 
         If a value or bit has several names, the first is used.
         """
