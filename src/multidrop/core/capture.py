@@ -100,7 +100,7 @@ class Decoder:
         self._c.block = ffi.NULL
         ffi.buffer(self._known)[:] = bytes(ffi.sizeof(self._known))
         self._c.taken = 0
-        self._blocks.clear()  # cleared last: until `known` is reset, the core uses these layouts
+        self._blocks.clear()  # cleared last: until `known` is reset, the C core uses these layouts
 
     @property
     def asked(self) -> tuple[Framing, Message]:

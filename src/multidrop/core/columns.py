@@ -1,4 +1,4 @@
-"""Memory for the core's structs; columns of rows, and their conversion to narrower columns of recordings."""
+"""Memory for the C core's structs; columns of rows, and their conversion to the columns of recordings."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ CHUNK_BYTES = 1 << 14
 
 
 class Chunk:
-    """A piece of memory for several structs of the core."""
+    """A piece of memory for several structs of the C core."""
 
     def __init__(self, size: int) -> None:
         self.owner = ffi.new("uint8_t[]", size + CACHE_LINE)
@@ -233,7 +233,7 @@ COLUMNS: dict[str, Literal["q", "H", "d"]] = {
 
 
 class Columns:
-    """Rows in the core's own memory, as one array per column (struct md_columns)."""
+    """Rows in the C core's own memory, as one array per column (struct md_columns)."""
 
     def __init__(self, room: int) -> None:
         self._own(lib.md_columns_new(room), lib.md_columns_free)

@@ -378,7 +378,7 @@ class Peer:
     """A drive's state and statistics (struct md_drive), shared by all its exchanges.
 
     `least_timeout` and `most_timeout`, in s, bound the timeout, which runs from the request's last bit to the
-    reply's first. Between these bounds, the core learns the timeout from the drive's response delays. At
+    reply's first. Between these bounds, the C core learns the timeout from the drive's response delays. At
     least `interval`, in s, passes between the end of an exchange and the next request.
     """
 
@@ -401,7 +401,7 @@ class Peer:
 
     @property
     def has_answered(self) -> bool:
-        """True once any reply came, even an exception, a late reply or a doubtful reply."""
+        """True once any reply came, even an exception, or a reply that is late or may be late."""
         return bool(self.c.counters.answered or self.c.history.late or self.c.doubtful)
 
     failures = number_at("c.failures")  # number of consecutive exchanges without a reply
@@ -425,9 +425,9 @@ class Peer:
     def prove_by(self, proofs: Sequence[Exchange]) -> None:
         """Set the proofs: reads whose replies show that no reply to an earlier request can still come.
 
-        If a late reply could be mistaken for a new one, the core sends a proof first. Only the first
+        If a late reply could be mistaken for a new one, the C core sends a proof first. Only the first
         MOST_PROOFS are used; their replies must all differ. Call this once, before the first exchange: from
-        then on the core reads the list.
+        then on the C core reads the list.
         """
         self.proofs = tuple(proofs[:MOST_PROOFS])
         self._c_proofs = ffi.new("struct md_exchange *[]", [proof.c for proof in self.proofs])
@@ -438,7 +438,7 @@ class Peer:
     def doubt_first_reply(self) -> None:
         """Do not accept the drive's first reply, which may answer another process's request.
 
-        After that reply, the core first sends one of the reads given to `prove_by`, and then repeats the
+        After that reply, the C core first sends one of the reads given to `prove_by`, and then repeats the
         request. If there are no such reads, the first reply is accepted.
         """
         self.c.is_doubted = True
@@ -515,7 +515,7 @@ class Exchange:
     ) -> None:
         least, most = answer or (0, -1)  # (0, -1): any raw value is accepted
         frame = build_request(framing, request)
-        # a longer frame is not stored: the core builds it for each exchange
+        # a longer frame is not stored: the C core builds it for each exchange
         kept = frame if len(frame) <= lib.MD_KEPT_FRAME else b""
         self.framing = framing
         self.request = request

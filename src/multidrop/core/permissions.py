@@ -13,7 +13,7 @@ from multidrop.core.process import register_at_fork
 
 
 class Latch:
-    """A drive's stop counter, which the core checks right before a request is sent.
+    """A drive's stop counter, which the C core checks right before a request is sent.
 
     `count` is the number of stops so far: a drive that is attached again gets a new latch, which continues
     the count. `revoke` takes no lock, so a signal handler may call it.

@@ -1,4 +1,4 @@
-"""Ports, on which the core's thread carries out exchanges, and the queue of the resulting rows."""
+"""Ports, on which the C core's thread carries out exchanges, and the queue of the resulting rows."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ utc_minus_monotonic_ns = lib.md_utc_minus_monotonic_ns
 
 
 class Echo(StrEnum):
-    """Whether an adapter echoes the bytes that it sends; with `AUTO` the core detects that."""
+    """Whether an adapter echoes the bytes that it sends; with `AUTO` the C core detects that."""
 
     AUTO = "auto"
     ON = "on"
@@ -96,8 +96,8 @@ class Echo(StrEnum):
 class RS485(StrEnum):
     """The party that switches the transceiver between receiving and sending.
 
-    `OFF`: the adapter itself. `KERNEL`: the driver's RS-485 mode. `RTS_UP`: the core, with RTS on while a
-    request is sent. `RTS_DOWN`: the core, with RTS off while a request is sent.
+    `OFF`: the adapter itself. `KERNEL`: the driver's RS-485 mode. `RTS_UP`: the C core, with RTS on while a
+    request is sent. `RTS_DOWN`: the C core, with RTS off while a request is sent.
     """
 
     OFF = "off"
@@ -150,7 +150,7 @@ NICE = -10  # nice value of threads that pass on polled values, if realtime sche
 
 
 class _Engine:
-    """The core's thread, one per process, started with the first port."""
+    """The C core's thread, one per process, started with the first port."""
 
     def __init__(self) -> None:
         self.forked()
@@ -166,7 +166,7 @@ class _Engine:
 
     @property
     def c(self) -> Any:
-        """The core's engine (struct md_engine). Raises OSError if the core's thread cannot be started."""
+        """The C core's engine (struct md_engine). Raises OSError if the C core's thread cannot be started."""
         with self._starting:
             if self._c is None:
                 started = lib.md_engine_start()
@@ -176,7 +176,7 @@ class _Engine:
             return self._c
 
     def set_realtime(self, client: Realtime, wanted: bool) -> None:
-        """Give the core's thread realtime scheduling while any client wants it.
+        """Give the C core's thread realtime scheduling while any client wants it.
 
         Raises OSError if the system refuses.
         """
@@ -278,7 +278,7 @@ WHY_NOT_NICE = (
 
 
 def wake_lateness(seconds: float, *, realtime: bool) -> list[float]:
-    """Sleep repeatedly, as the core does, for `seconds` s in total; return how late each sleep ended, in s.
+    """Sleep repeatedly, as the C core does, for `seconds` s in total; return how late each sleep ended, in s.
 
     Raises OSError if `realtime` scheduling is refused.
     """
@@ -360,13 +360,13 @@ def set_settings(fd: int, baudrate: int, format: str) -> int:
 class _PortMemory:
     """All memory of Python objects that the C core's thread reads or writes for one port.
 
-    Store an object here before passing it to the core.
+    Store an object here before passing it to the C core.
     """
 
     def __init__(self, room: int, mastership: Mastership | None) -> None:
         self.mastership = mastership
         self.lasting: set[object] = set()  # objects kept until the port closes
-        self.queued: list[Exchange | None] = [None] * room  # queued exchanges, by index in the core's ring
+        self.queued: list[Exchange | None] = [None] * room  # queued exchanges, by index in the C core's ring
         self._newest: dict[str, tuple[object, ...]] = {}
 
     @contextmanager
@@ -383,7 +383,7 @@ _engine = _Engine()
 def _owner_of(port: Any, memory: _PortMemory) -> Any:
     """Return the owner of a port and of its memory.
 
-    When the last reference to the owner is gone, the core's thread first releases the port. Then the memory
+    When the last reference to the owner is gone, the C core's thread first releases the port. Then the memory
     is freed. That order is certain, also at interpreter exit: cffi calls its destructor before it drops the
     handle, and the garbage collector calls all destructors before it frees memory. No Python code runs in
     between, so no signal can interrupt this.
@@ -400,7 +400,7 @@ def _stop(port: Any, memory: _PortMemory) -> None:
 
 
 class Port:
-    """A descriptor on which the core's thread carries out exchanges (struct md_port).
+    """A descriptor on which the C core's thread carries out exchanges (struct md_port).
 
     `must_take` is a mask (of REFUSALS): the settings that the port must not refuse. It is -1 for a port that
     has no settings, such as a socket. `room` is the length of the queue, a power of two. `transactions` is
@@ -430,7 +430,8 @@ class Port:
         self._abandoned.atexit = False
         if mastership is not None:
             lib.md_port_fence(self.c, mastership.c)
-        # Python reads this struct directly: a call into the core would release the GIL and wait for it again.
+        # Python reads this struct directly: a call into the C core would release the GIL and wait for it
+        # again.
         self._progress = lib.md_port_progress(self.c)
         register_at_fork(self)
 
@@ -540,7 +541,7 @@ class Port:
 
     @property
     def has_echo(self) -> bool:
-        """True once the adapter is known to echo; the core then never mistakes an echo for a reply."""
+        """True once the adapter is known to echo; the C core then never mistakes an echo for a reply."""
         return int(self._progress.echo) == int(lib.MD_ECHO)
 
     @property

@@ -235,7 +235,7 @@ class Register(Generic[T]):
         return max(0, *(-int(part.normalize().as_tuple().exponent) for part in parts))
 
     def number_in(self, data: bytes, at: int) -> float | None:
-        """Return the number at word (coils: bit) `at` of a reply's data; None for no value.
+        """Return the number at index `at` of a reply's data, or None. `at` counts words, or bits for coils.
 
         The number is as in polled rows: in the register's unit, or the raw count of a named value.
         """
@@ -504,9 +504,10 @@ def _declare(access: Access, address: int, what: Any, given: Details) -> Registe
 
 
 def row_field(register: Register[Any], at: int, code: int) -> Field:
-    """Return the Field with which the C core decodes this register, at word (coils: bit) `at` of a reply.
+    """Return the Field with which the C core decodes this register in a reply.
 
-    `code` is the number that stands for the register's name in polled rows.
+    `at` is the index in the reply's data, in words, or in bits for coils. `code` is the number that stands
+    for the register's name in polled rows.
     """
     multiplier, _, divisor = register.coding.factors
     return Field(at, register.coding.core_format, code, multiplier, divisor, _extra(register, at))

@@ -100,7 +100,7 @@ def write_request(drive: Any, register: Register[Any], raw: float, address: int 
     table = register.table
     if not register.writable or table.write is None:
         raise ValueError(
-            f"{register.name} of {drive.name} cannot be written: it is a {register.access.value}"
+            f"{register.name} of {drive.name} cannot be written: it is declared as a {register.access.value}"
         )
     to = drive.address if address is None else address
     at = register.address if register.ram_address is None else register.ram_address

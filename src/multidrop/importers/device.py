@@ -175,7 +175,7 @@ class ImportedRegister:
     lacks: str = ""
     is_read: bool = True
     is_written: bool = False
-    of_writes: dict[str, Any] = field(default_factory=dict)  # further keys for a declaration that allows writes
+    of_writes: dict[str, Any] = field(default_factory=dict)  # more keys for a writable register
 
     def note_write(self, *, is_written: bool = True) -> None:
         """Record whether the program that made the file writes the register; if it does, add a gap."""

@@ -1,4 +1,4 @@
-"""The clock of polling and writing: CLOCK_MONOTONIC, as the core reads it.
+"""The clock of polling and writing: CLOCK_MONOTONIC, as the C core reads it.
 
 Deadlines of requests use CLOCK_BOOTTIME, which continues while the computer sleeps. Call these functions
 through the module, as `clock.now_ns()`, so that tests can replace them in one place.
@@ -32,7 +32,7 @@ if hasattr(time, "clock_gettime_ns"):  # faster than calling the core's function
 else:
 
     def now_ns() -> int:
-        """Return the core's time in ns, on a system without CLOCK_MONOTONIC in Python."""
+        """Return the C core's time in ns, on a system without CLOCK_MONOTONIC in Python."""
         return int(core_now_ns())
 
 

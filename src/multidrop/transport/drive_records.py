@@ -1,4 +1,4 @@
-"""Keep for each drive the core's record of it (`Peer`), and the exchanges that read its registers.
+"""Keep for each drive the C core's record of it (`Peer`), and the exchanges that read its registers.
 
 The record has the learnt timing, and the requests to which late replies may still come. It is kept even while
 the drive is off the line.
@@ -88,7 +88,7 @@ LEAST_TIMEOUT = 0.02  # s; time allowed at least for a reply, because computer a
 
 
 class Peers:
-    """The core's records of the drives on one line.
+    """The C core's records of the drives on one line.
 
     Threads may read the records while one thread adds or removes a drive.
     """
@@ -115,7 +115,7 @@ class Peers:
         least = min(drive.response_timeout, documented)
         asked_as = type(drive), drive.framing, drive.settings, silence(drive), least, drive.response_timeout
         key = drive.address, *asked_as
-        # a known record is used again and never replaced, because the core's thread may still be reading it
+        # a known record is used again and never replaced, because the C core's thread may still be reading it
         if key not in self._known:
             self._known[key] = self._new(drive, least)
         peer = self.present[drive] = self._known[key]
@@ -155,7 +155,7 @@ class Peers:
         del self.present[drive]
 
     def of(self, drive: Drive) -> Peer:
-        """Return the core's record of a drive. Raises NotAttached for a drive that is not on this bus."""
+        """Return the C core's record of a drive. Raises NotAttached for a drive that is not on this bus."""
         peer = self.present.get(drive) if isinstance(drive, Drive) else None
         if peer is None:
             check_drive(drive)
@@ -196,7 +196,7 @@ MOST_EXACT = 1 << 53  # every whole number up to this limit is exact as a float
 
 
 def _is_exact(register: Register[Any]) -> bool:
-    """Return True if the core, which calculates with floats, gives the same value as `Register.value_in`."""
+    """Return True if the C core, which uses floats, gives the same value as `Register.value_in`."""
     coding = register.coding
     if register.scaled_by is not None:
         return False
@@ -213,7 +213,7 @@ class BlockDecoder:
     def __init__(self, registers: tuple[Register[Any], ...], start: int) -> None:
         places = [(register, register.address - start) for register in registers]
         exact = [(register, at) for register, at in places if _is_exact(register)]
-        # Names of the registers that the core decodes.
+        # Names of the registers that the C core decodes.
         self.names = tuple(register.name for register, _ in exact)
         self.layout = RowLayout(0, [row_field(register, at, 0) for register, at in exact])
         self.count = len(exact)
@@ -271,8 +271,8 @@ def make_exchange(
 def make_read(drive: Drive, block: Block, peer: Peer, rows: RowLayout = NO_ROWS, **details: Any) -> Exchange:
     """Return an exchange that reads a block.
 
-    If the drive has an echo probe (a register whose reply is never a copy of its request), the core can read
-    it first to find out whether the adapter echoes. A block with that register needs no probe.
+    If the drive has an echo probe (a register whose reply is never a copy of its request), the C core can
+    read it first to find out whether the adapter echoes. A block with that register needs no probe.
     """
     probe, register = None, drive.echo_probe
     if register and register not in block.registers:

@@ -413,7 +413,7 @@ class Exchanges:
     ) -> Completion:
         """If late replies prevented the exchange, wait for these replies, then carry out the exchange again.
 
-        The wait ends when the exchange expires. After the wait, the core first sends a proof: a read whose
+        The wait ends when the exchange expires. After the wait, the C core first sends a proof: a read whose
         reply shows that no earlier reply can still come. Raises NotMaster if another process may be the
         line's master.
         """

@@ -175,7 +175,7 @@ class Line:
         self.ids = ids
         self._echo = echo
         self._opened = OpenPort(port, ids, rs485, mastership, settle)
-        # The core's port, on which exchanges are queued; None before `open`, and after `drop`.
+        # The C core's port, on which exchanges are queued; None before `open`, and after `drop`.
         self.queue: Port | None = None
         self._tap: Tap | None = None
         self._log = LineLog(port)

@@ -246,11 +246,11 @@ PORT_FAILURES = (OSError, _terminal_error, serial.SerialException, ValueError, E
 # MOST_STALL_MS and MOST_AGE are below WRITE_TIMEOUT: no write is sent after it was reported as unconfirmed.
 MOST_STALL_MS = 750  # ms; the kernel cuts a connection that stalls for longer
 MOST_AGE = 0.25  # s; the bridge does not forward a request older than this
-MOST_CHUNK = 1024  # limit of the bytes that the core reads in one call
+MOST_CHUNK = 1024  # limit of the bytes that the C core reads in one call
 LOOK_EVERY = 0.1  # s between checks whether the bridge was closed
 CLOSING_TIME = 2.0  # s; limit of the wait for the bridge's threads, which the port may block
 
-# On Linux the socket pair keeps requests separate, and gives the time at which the core wrote each request.
+# On Linux the socket pair keeps requests separate, and gives the time at which the C core wrote each request.
 _STAMPED = sys.platform == "linux"
 _KIND = socket.SOCK_SEQPACKET if _STAMPED else socket.SOCK_STREAM
 _SO_TIMESTAMPNS = 35  # asm-generic/socket.h; the control message is a struct timespec
@@ -296,7 +296,7 @@ def _pair() -> tuple[socket.socket, socket.socket]:
 class Bridge:
     """A descriptor for a port that has none: a socket pair, and a thread for each direction.
 
-    A request older than MOST_AGE is discarded, not forwarded: the core has already given it up. A request
+    A request older than MOST_AGE is discarded, not forwarded: the C core has already given it up. A request
     gets that old if the process was suspended, or if the port blocked its thread.
     """
 
@@ -322,7 +322,7 @@ class Bridge:
             raise OSError(errno.ENOMEM, str(failure)) from failure
 
     def _run(self, copy: Callable[[], None]) -> None:
-        """Copy bytes one way until the port fails; then hang up, so that the core sees a lost port."""
+        """Copy bytes one way until the port fails; then hang up, so that the C core sees a lost port."""
         try:
             copy()
         except PORT_FAILURES:
@@ -344,7 +344,7 @@ class Bridge:
                 self._port.write(request)
 
     def _take(self) -> tuple[bytes, bool]:
-        """Return a request of the core, and True if it is younger than MOST_AGE or has no time stamp."""
+        """Return a request of the C core, and True if it is younger than MOST_AGE or has no time stamp."""
         if not _STAMPED:
             return self._ours.recv(MOST_CHUNK), True
         request, stamps, _, _ = self._ours.recvmsg(MOST_CHUNK, socket.CMSG_SPACE(_TIMESPEC.size))
@@ -359,7 +359,7 @@ class Bridge:
                 self._hand_over(received[at : at + MOST_CHUNK])
 
     def _hand_over(self, chunk: bytes) -> None:
-        """Pass these bytes to the core. Until the core has read them, further bytes stay in the port."""
+        """Pass these bytes to the C core. Until the C core has read them, further bytes stay in the port."""
         while chunk and not self._closing.is_set():
             with suppress(TimeoutError):
                 chunk = chunk[self._ours.send(chunk) :]

@@ -1,4 +1,4 @@
-"""Open a port by its name, and give its descriptor to the core."""
+"""Open a port by its name, and give its descriptor to the C core."""
 
 from __future__ import annotations
 
@@ -159,7 +159,7 @@ def unopened(port: str) -> serial.Serial:
 
 
 def is_bridged(port: serial.SerialBase) -> bool:
-    """Return True if the core cannot write to this port directly, so that a thread forwards its requests."""
+    """Return True if a thread (a bridge) must forward requests, because the C core cannot write to the port."""
     return type(port).read is not serial.Serial.read and not isinstance(port, SocketPort)
 
 
@@ -167,7 +167,7 @@ def check_port(port: str, mastership: Mastership | None) -> None:
     """Raise NoSuchPort for an invalid port name, and TypeError unless `mastership` is a Mastership or None.
 
     With a mastership, raise NoSuchPort for a bridged port too. The bridge's thread could send a request after
-    the mastership was lost, because it takes requests from the core before it sends them.
+    the mastership was lost, because it takes requests from the C core before it sends them.
     """
     if mastership is not None and not isinstance(mastership, Mastership):
         raise TypeError(f"mastership takes a multidrop.core.Mastership, not {mastership!r}")
@@ -211,7 +211,7 @@ def failing_refusals(device: str) -> int:
     return must_take(device) | (NO_DIVISOR if port_identity.has_divisor(device) else 0)
 
 
-TOLERANCE = 0.02  # greatest relative error of a baud rate that the core and the kernel accept
+TOLERANCE = 0.02  # greatest relative error of a baud rate that the C core and the kernel accept
 CLOSING_S = 0.75  # seconds in which a stalled adapter must take the driver's bytes when the port closes
 _UNNOTICED_S = 0.05  # s; a healthy adapter takes all bytes of the driver within this time
 BY_PLACE = "/dev/serial/by-path/"  # links whose names state the USB socket, not the adapter
@@ -226,7 +226,7 @@ def _refusal(rs485: RS485, failure: OSError) -> str:
 
 
 class OpenPort:
-    """A pyserial port, with a bridge if the core cannot use it directly.
+    """A pyserial port, with a bridge if the C core cannot use it directly.
 
     The port may be opened and closed repeatedly, by one thread at a time.
     """
@@ -249,7 +249,7 @@ class OpenPort:
         self.must_discard = False  # True: the driver may hold bytes of a command that has ended
 
     def open(self) -> Port:
-        """Open the port, wait for `settle` s, discard the input, and return the core's port.
+        """Open the port, wait for `settle` s, discard the input, and return the C core's port.
 
         Raises LineError or one of PORT_FAILURES; the caller must then call `close`.
         """

@@ -279,7 +279,7 @@ def _middle(counters: Counters, bucket: int) -> float:
 
 
 class Count(NamedTuple):
-    """A reading: statistics since the line was opened, and the core's record of each drive by drive name."""
+    """Statistics of a line since it was opened, and the C core's record of each drive, by drive name."""
 
     statistics: LineStatistics
     peers: Mapping[str, Peer]
@@ -288,7 +288,7 @@ class Count(NamedTuple):
 class LineMeter:
     """Statistics of a line since it was opened or last reset; frozen when the line is closed.
 
-    At a reset, each drive's counts are kept with the core's record of the drive, because another drive may
+    At a reset, each drive's counts are kept with the C core's record of the drive, because another drive may
     get the same name later.
     """
 
