@@ -159,7 +159,7 @@ def unopened(port: str) -> serial.Serial:
 
 
 def is_bridged(port: serial.SerialBase) -> bool:
-    """Return True if a thread (a bridge) must forward requests, because the C core cannot write to the port."""
+    """Return True if a thread (a bridge) must forward requests, because the C core cannot use the port."""
     return type(port).read is not serial.Serial.read and not isinstance(port, SocketPort)
 
 
