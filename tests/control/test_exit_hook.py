@@ -150,7 +150,8 @@ def test_a_repeated_hang_up_signal_does_not_end_the_wait(caught: list[int]) -> N
     try:
         hook, act = ExitHook(), Act()
         made = hook.add(act.begin, act.work)
-        hook._before[signal.SIGHUP] = lambda number, frame: caught.append(number)  # as if set by the program
+        # the program's own handler
+        hook._before[signal.SIGHUP] = lambda number, frame: caught.append(number)
         for _ in range(4):
             signal.raise_signal(signal.SIGHUP)
         assert act.is_begun

@@ -53,9 +53,8 @@ def be_silent(bus: Bus, drive: Any, received: ReceivedRequests) -> None:
     timeouts = bus.peer(drive).c
     timeouts.least_timeout_ns = timeouts.most_timeout_ns = 50_000_000
     received.loses = lambda request: True
-    earlier = bus.statistics().counters.sent - len(
-        received.requests
-    )  # earlier requests, which the test has removed
+    # number of requests that the test has removed from `received.requests`
+    earlier = bus.statistics().counters.sent - len(received.requests)
     with pytest.raises(NoReply):
         drive.read(next(register for register in drive.registers.values() if register.readable))
     # wait until the simulator has received the last request
@@ -272,7 +271,7 @@ def test_detaching_a_drive_forgets_that_its_identity_check_failed() -> None:
     bus, drive, sim = one(InvtCHE(1, maximum_frequency=50))
     sim["device"] = GOODRIVE
     check = bus.bus._writer.identity_check
-    for _ in range(2):  # without the detach, the second wrong identity would withhold the stop
+    for _ in range(2):  # without the detach, the second wrong identity would prevent the stop
         with pytest.raises(CheckAgain):
             check.check_before_stop(drive, drive.control, 5)
         bus.bus.detach(drive)

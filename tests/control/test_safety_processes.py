@@ -30,8 +30,8 @@ from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 CLIENT = """
 import signal, sys, time
 from multidrop import Bus, InvtCHE
-signal.signal(signal.SIGHUP, signal.SIG_DFL)  # whatever the tests were begun with
-class Pump(InvtCHE):  # is waited for however busy the machine is
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # pytest may run with another handler
+class Pump(InvtCHE):  # long timeouts for a busy machine
     response_timeout = 60.0
     response_delay = 15.0
 with Bus(sys.argv[1], expiry=60) as bus:
@@ -83,7 +83,7 @@ def test_motors_are_stopped_at_exit_only_with_stop_on_exit(ending: str, opted: s
         assert client.returncode in (status, -int(number or 0))
         written = [write.raw for write in sim.counters.writes if write.name == "control"]
         assert written[:2] == ([1, 5] if opted == "stop" else [1])
-        assert set(written[2:]) <= {5, 8}  # 5 is a stop, repeated after a late reply; 8 ends a jog
+        assert set(written[2:]) <= {5, 8}  # stops (5) and STOP_JOG (8), repeated if a reply is late
         assert sim.motor.energised == (opted == "leave")
 
 

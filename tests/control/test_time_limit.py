@@ -276,7 +276,7 @@ CLIENT = """
 import sys
 from pathlib import Path
 from multidrop import Bus, Expired, InvtCHE
-class Pump(InvtCHE):  # is waited for however busy the machine is
+class Pump(InvtCHE):  # long timeouts for a busy machine
     response_timeout = 60.0
     response_delay = 15.0
 with Bus(sys.argv[1], expiry=600) as bus:

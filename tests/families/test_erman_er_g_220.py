@@ -193,7 +193,7 @@ def test_erman_start_coil_is_cleared_after_an_unconfirmed_stop() -> None:
             (wire.drive.stop if stop == STOP_ON else wire.drive.emergency_stop)()
         assert wire.sent == [*[stop] * 3, START_OFF]
         wire = Wire(ErmanERG220(1), STOPPED, {stop: lost, START_OFF: lost})
-        # START_OFF is sent only once, because the caller repeats the whole stop
+        # START_OFF is sent once, even if it is unconfirmed: the caller then repeats the whole stop.
         with pytest.raises(Unconfirmed, match="no reply"):
             (wire.drive.stop if stop == STOP_ON else wire.drive.emergency_stop)()
         assert wire.sent == [*[stop] * 3, START_OFF]

@@ -70,7 +70,7 @@ class Hazard:
     refuses: str = ""  # text of the error that refuses the action
     error: type[Exception] = WriteForbidden
     shows: Mapping[str, Any] = field(default_factory=dict)
-    turning: bool = False  # if True, the motor is started and turns for a second before the action
+    turning: bool = False  # whether the motor turns for a second before the action
 
 
 def start(line: SimulatedBus, drive: Any, sim: Any) -> None:

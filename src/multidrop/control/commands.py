@@ -167,7 +167,7 @@ async def _stop_without_threads(works: Sequence[StopWork]) -> Results:
     """Send each stop once before waiting for any motor to stop; then repeat one stop after another.
 
     As soon as the system has a thread again, a stop continues in that thread. The event loop runs between the
-    stops, because a gateway in a fleet must renew its lease: without a lease it may not send a stop.
+    stops, because a gateway in a fleet must renew its right to send. Without this right it sends no stop.
     """
     loop = asyncio.get_running_loop()
     found: Results = {}

@@ -29,7 +29,7 @@ from multidrop.families.makes import MAKES, Evidence, Make, easily_mistaken_for,
 from multidrop.transport import clock
 from multidrop.transport.exchange import READ_ATTEMPTS, READ_FAILURES, WRITE_TIMEOUT, Exchanges
 
-SURE = 2  # number of checks in a row that must find another family before a stop is withheld
+SURE = 2  # number of checks in a row that must find another family before a stop is refused
 
 Timed = Callable[[], AbstractContextManager[None]]
 
@@ -230,7 +230,7 @@ class IdentityCheck:
         The raw count that stops one family may run the motor of another. But a failed check does not prove
         that the drive is of another family. A parameter such as an address or a baud rate may hold a value
         that is not in force yet, and a reply may belong to an earlier request. In such a case the stop is
-        sent. The stop is withheld only if `identify` fails SURE times in a row, every request was answered so
+        sent. It is refused only if `identify` fails SURE times in a row, every request was answered so
         far, and there is more evidence. Any one of these is enough: another built-in family recognises the
         drive; the drive answers as a make whose motor this raw count would run; `identify` raised
         WriteForbidden with the rule ANOTHER_FAMILY.

@@ -30,11 +30,11 @@ def start_staggered(drives: Sequence[Drive], gap: float, direction: Direction | 
     """Start drives one after another, `gap` seconds apart.
 
     If a start fails, stop that drive and all started before it, and raise the failure. The failing drive gets
-    no stop if its identity is not confirmed and nothing was sent to it: it may be of another family, which
-    the stop would start. A drive whose stop is called on any thread during this call is not started. Drives
-    that are not started yet are read regularly. After a silence, the setpoint of a drive that cannot report
-    it is assumed lost, and its start raises WriteForbidden. Raises Expired if a start comes late because the
-    computer slept or the process was suspended.
+    no stop if its identity is not confirmed and nothing was sent to it: it may be of another family, and the
+    stop of its declared family might start it. A drive whose stop is called on any thread during this call
+    is not started. Drives that are not started yet are read regularly. After a silence, the setpoint of a
+    drive that cannot report it is assumed lost, and its start raises WriteForbidden. Raises Expired if a
+    start comes late because the computer slept or the process was suspended.
     """
     if not 0 <= gap < inf:
         raise ValueError(f"gap = {gap:g} s: it must be 0 or more")

@@ -162,8 +162,8 @@ class InvtCHE(Drive):
       with and without a decimal; the output power (3006H) is 0.1 % in the Goodrive300L manual, and 0.01 kW
       on a CHF100A, whose owner compared the register with the keypad.
     - The example that writes 5000 to 0008H does not say what that register is: do not repeat it.
-    - STOP may not end a jog: if the motor still turns after STOP, or the motor's state is unknown, STOP_JOG
-      follows at once. A start may not end a jog either: after a jog a stop is required before a start.
+    - STOP might not end a jog: if the motor still turns after STOP, or the motor's state is unknown, STOP_JOG
+      follows at once. A start might not end a jog either: after a jog a stop is required before a start.
       Whether a jog ends a run is not stated: `jog` is refused while the motor turns.
     - State words other than 1 to 4 are not explained: while one is shown, `start` and `jog` are refused.
     - Exception 03 is a malformed frame; a value out of range is 12H.

@@ -30,7 +30,7 @@ from multidrop.transport import clock, drive_records
 S = 1_000_000_000
 REGISTERS = 5  # polled registers per drive
 EVERY = 0.5  # s, period of the first register; the others are polled as fast as possible
-HEALTHY, FAULTY = 4.0, 8.0  # seconds without the fault, then seconds with it
+HEALTHY, FAULTY = 4.0, 8.0  # s before the fault, s of the fault
 CYCLES = 10  # poll cycles within which the rate must recover
 UNASKED = {str(each) for each in (Status.NOT_ASKED, Status.LINE_LOST, Status.LATE_ANSWER_DUE)}
 START, STOP = (Message(31, 6, 0x1000, data=bytes([word, 0])) for word in (0xC4, 0xC0))
