@@ -235,4 +235,4 @@ class WriteForbidden(BusError, ValueError):
 
 
 class CheckAgain(Exception):
-    """A drive to stop answers as another family would: stop the others first, then check it again."""
+    """The drive to be stopped answers like another family: stop the others first, then check it again."""

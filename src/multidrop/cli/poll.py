@@ -117,8 +117,8 @@ def follow(
 ) -> dict[str, Any]:
     """Poll the plant as the polling arguments require; return the summary.
 
-    `how` says how the recording is split into files. `beside` returns a context that lasts while the plant
-    is polled.
+    `how` says how the recording is split into files. `beside` makes a context for the time of polling, such
+    as the demo's operator.
     """
     if arguments.capture:
         check_capture(arguments.capture)

@@ -235,7 +235,7 @@ def _side_by_side(drive: Drive, wanted: list[tuple[range, Register[Any]]]) -> _N
 
 @dataclass(frozen=True)
 class _Division:
-    """One way to read registers: with as many requests, no other way transfers fewer characters."""
+    """One way to divide registers into requests, with the fewest characters for that many requests."""
 
     characters: int  # characters of all requests and their replies
     spans: tuple[tuple[int, int], ...]  # begin and end of each request, which reads registers[begin:end]
@@ -357,7 +357,7 @@ def proofs(drive: Drive) -> list[tuple[Block, RawRange | None]]:
 
 @lru_cache(maxsize=256)
 def _with_distinct_replies(family: Any) -> tuple[tuple[Register[Any], ...], ...]:
-    """Return requests with different forms of replies, each as the tuple of registers that it reads.
+    """Return requests whose replies differ in form, such as in length; each is a tuple of registers.
 
     Requests for readings come first, because readings are polled anyway. Shorter requests come before longer
     ones. If there are many requests, only the first MOST_PROOFS and the last one are returned.

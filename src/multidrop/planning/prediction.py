@@ -24,7 +24,7 @@ from multidrop.planning.bus_time import gap, in_order, kind, silence, switches
 from multidrop.planning.schedule import TURN_SHARE, Job, Schedule
 
 LATENESS = 100e-6  # seconds that a typical computer adds to each exchange, to wake up and to write
-ENOUGH = 0.97  # fraction of the wanted rate that a reached rate must have
+ENOUGH = 0.97  # a rate counts as reached if at least this fraction of it is reached
 LEAST_EXCHANGES = 1000  # least number of simulated exchanges
 LEAST_ROUNDS = 3  # least number of simulated exchanges per job
 FAR_NS = 1 << 62

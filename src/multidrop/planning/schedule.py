@@ -177,7 +177,7 @@ class BackOff:
         return round(sum(health.cost_ns for health in self.health.values() if health.pause_ns) / SILENT_SHARE)
 
     def _end_next_pause(self, drive: int, now_ns: int) -> None:
-        """Of the silent drives except `drive`, retry now the one with the shortest remaining pause."""
+        """End the shortest remaining pause of a silent drive, except that of `drive`."""
         paused = [health for number, health in self.health.items() if health.pause_ns and number != drive]
         if paused:
             first = min(paused, key=lambda health: health.paused_until_ns)

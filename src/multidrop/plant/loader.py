@@ -259,7 +259,7 @@ def _line(table: Any, place: TomlPlace) -> PlantLine | None:
 
 
 def _drive(table: Any, line: Mapping[str, Any], place: TomlPlace) -> PolledDrive | None:
-    """Return the drive; None if its entry has a mistake, unless it can still be stopped."""
+    """Return the drive; None if its entry has a mistake other than in `every`, `poll` and channels."""
     before = len(place.config_errors)
     model = _model(table, place)
     given = place.check(table, DRIVE_KEYS | _option_keys(model))

@@ -307,7 +307,7 @@ class PolledLine:
         present = self._jobs(drive)
         old = [job for job in present if job not in wanted]
         # New jobs are first due when the earliest replaced job with the same period would have been due. If
-        # no job with this period is replaced, they are due with the earliest other job.
+        # no job with this period is replaced, they are due with the earliest other job with this period.
         latest_first = [*sorted(present, key=_due, reverse=True), *sorted(old, key=_due, reverse=True)]
         dues = {job.period_ns: job.due_ns for job in latest_first}
         self._refusals.forget(drive)

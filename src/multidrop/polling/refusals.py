@@ -76,7 +76,7 @@ class Refusals:
     def _is_refused(self, job: PolledJob) -> bool:
         """Return True if a job's block was refused too often in a row.
 
-        The limit is REFUSALS. For a part of a split block with several registers, it is 1.
+        The limit is REFUSALS exceptions. For a part of a split block that has several registers, it is 1.
         """
         count = job.rows.refusals
         if not count or job in self._trials or job is self._probes.get(job.drive):
@@ -129,8 +129,8 @@ class Refusals:
     def _split_unanswered(self, job: PolledJob, now_ns: int) -> None:
         """Split a block that stays unanswered and may be too long.
 
-        This is only done if the drive answers other requests. If all its blocks may be too long, it first
-        gets a request for a single register.
+        This is only done if the drive answers other requests. A drive that has never answered also gets
+        requests for a single register, if all its blocks may be too long.
         """
         peer, drive = job.exchange.peer, job.owner
         if job.rows.is_answered or job in self._trials:
@@ -145,7 +145,7 @@ class Refusals:
                 self._schedule.add(probe, now_ns)
 
     def _end_probes(self) -> None:
-        """Remove the jobs in `_probes` of drives that now answer all blocks."""
+        """Remove the jobs in `_probes` of drives that now answer all blocks of several registers."""
         doubtful = {
             job.drive for job in self._schedule.jobs if job.may_be_too_long and not job.rows.is_answered
         }

@@ -76,7 +76,10 @@ class BatchCaller:
             _log.error("on_batch: the function failed and is no longer called", exc_info=failure)
 
     def join(self) -> None:
-        """Wait until the user's function has returned from the last call. Called by it, return at once."""
+        """Wait until the user's function has returned from the last call.
+
+        If that function itself calls this, return immediately.
+        """
         if threading.current_thread() is not self._thread:
             self._thread.join()
 
@@ -198,7 +201,7 @@ class RowSource:
         `every` None means 0.1 s, or 0.02 s if realtime scheduling was granted.
 
         Once the poller is closed, the remaining batches are yielded immediately. Raises PollingFailed like
-        `take`. Raises ValueError if polling has not started, which the poller's `with` block does.
+        `take`. Raises ValueError before the poller's `with` block, which starts polling.
         """
         self._check_started()
         return self._yield_batches(seconds, every)

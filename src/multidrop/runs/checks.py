@@ -154,7 +154,7 @@ def silence_of(plan: RunPlan) -> float:
 
 
 def misfits(plan: RunPlan) -> list[str]:
-    """Return a sentence for each step and time that is too short for its line, with a possible value."""
+    """Return a sentence for each part of the test for which a line is too slow, with a possible value."""
     found = list(dict.fromkeys(_misfits(plan)))
     least = CYCLES * longest_pause(plan)
     if silence_of(plan) < least:

@@ -100,7 +100,7 @@ class TestRun:
         self._phases = [*dict.fromkeys([*(step.name for step in self.plan.steps), STOP])]
 
     def misfits(self) -> list[str]:
-        """Return a sentence for each step and time that is too short for its line, with a possible value."""
+        """Return a sentence for each part of the test for which a line is too slow, with a possible value."""
         return misfits(self.plan)
 
     @property
