@@ -135,7 +135,7 @@ class StoredPosition(NamedTuple):
     """The position up to which a sink has stored the stream."""
 
     place: int  # stream position of the last stored message
-    sources: Mapping[str, int]  # sequence number of the last stored message, by gateway and id of its log
+    sources: Mapping[str, int]  # sequence number of the last stored message, by gateway and id of the spool
 
 
 class Commit(NamedTuple):
@@ -186,7 +186,7 @@ class HubState(NamedTuple):
 class SampleHub:
     """Copies the rows of a fleet's sample stream into a sink, such as a database.
 
-    It stores them in commits: every `every` seconds, or as soon as a million rows are pending.
+    It stores them in batches (commits): every `every` seconds, or as soon as a million rows are pending.
     """
 
     def __init__(self, path: ServerPath, sink: SampleSink, *, every: float = 10.0) -> None:

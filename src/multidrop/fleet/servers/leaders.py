@@ -168,10 +168,10 @@ class LeaseTerms:
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._silent_since: float | None = None
-        self._handed_at: dict[str, float] = {}  # time of the last hand-over, by bucket
+        self._handed_at: dict[str, float] = {}  # time of the last change of leaders, by bucket
 
     async def keep_ahead(self, path: ServerPath, clusters: Mapping[str, Cluster]) -> bool:
-        """Move the leadership of each lease bucket that has a silent server to another server.
+        """Change the leader of each lease bucket that has a silent server.
 
         Skip a bucket whose leader was changed less than HAND_OVER_S ago. Stop after a change that failed, so
         that at most one bucket must wait for an election. Return True if a change was tried.
@@ -202,7 +202,7 @@ class LeaseTerms:
 
 
 async def _leads_now(path: ServerPath, bucket: str, server: str) -> bool:
-    """Hand a bucket over to this server; return True once the server leads it.
+    """Make this server the leader of a bucket; return True once it is the leader.
 
     Return False if that takes longer than HANDED_S.
     """
@@ -229,7 +229,7 @@ async def keep_leaders(
                 await bring_leaders_home(best, clusters)
 
 
-# ---- releases of lines ----
+# ---- lines that are handed over to other gateways ----
 
 
 class Releases:
