@@ -212,7 +212,7 @@ class ClientWrites:
     """Carries out the writes of clients that share a role and an interface, such as "modbus".
 
     `common` has the addresses of the registers that every drive has in the same form, or is None without such
-    registers. `standstill` refuses writes that may have waited while the gateway did not run.
+    registers. `standstill` refuses writes that may have waited during a pause of the gateway.
     """
 
     def __init__(

@@ -300,7 +300,7 @@ class CommonBlock:
         answer = hub.last_answer(self._name)
         if answer is None:
             return NEVER
-        if answer[1] < woke_ns:  # the value was requested before the computer slept, for an unknown time
+        if answer[1] < woke_ns:  # the computer slept after the request, for an unknown time
             return LONGEST_AGE
         return min(max(now_ns - answer[1], 0) // 1_000_000, LONGEST_AGE)
 
