@@ -8,6 +8,7 @@ import sys
 import tempfile
 from contextlib import closing
 from datetime import UTC, datetime, timedelta, timezone
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -423,6 +424,28 @@ def test_a_segment_of_version_0_1_with_too_many_names_is_damaged(tmp_path: Path)
     with History(tmp_path / "run.arrows") as history:
         assert rows_in(history) == []
         assert "65537 names; the limit is 65536" in history.damage[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("points", [5, 20], ids=["ten-second summaries", "rows"])
+@pytest.mark.parametrize("compacted", [0, 1], ids="{} compacted".format)
+def test_infinite_values_are_missed_in_buckets(tmp_path: Path, compacted: int, points: int) -> None:
+    values = [1.0, inf, 3.0, -inf, 1.5]
+    rows = [
+        Row(NOON + at * SECOND // 10, DAY + at, 1, "pump-1", "speed", value, "ok")
+        for at, value in enumerate(values)
+    ]
+    record(tmp_path, [rows])
+    if compacted:
+        pytest.importorskip("duckdb", reason="needs duckdb")
+        compact(tmp_path, compacted + 1)
+    end = NOON + (20 if points == 20 else 50) * SECOND
+    with History(tmp_path) as history:
+        found = history.buckets("pump-1.speed", NOON, end, points)["pump-1.speed"]
+        assert [row.value for row in rows_in(history)] == values
+    assert (found.n[0], found.missed[0]) == (3, 2)
+    assert (found.least[0], found.most[0]) == (1.0, 3.0)
+    assert found.mean[0] == pytest.approx(5.5 / 3)
 
 
 @pytest.mark.parametrize("value", [0.1, 1.7e308, -1.7e308])

@@ -33,7 +33,7 @@ class Buckets:
     begin: int  # UTC in ns
     step: int  # in ns
     n: list[int]  # number of values in each bucket
-    missed: list[int]  # number of failed reads in each bucket
+    missed: list[int]  # number of failed reads in each bucket, and of values that are not finite
     least: list[float | None]
     mean: list[float | None]
     most: list[float | None]

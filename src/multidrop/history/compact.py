@@ -16,7 +16,15 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from multidrop.history.database import Database, copy_out, insert, insert_units, kept_metadata, with_units
+from multidrop.history.database import (
+    FINITE,
+    Database,
+    copy_out,
+    insert,
+    insert_units,
+    kept_metadata,
+    with_units,
+)
 from multidrop.history.folder import STEM, HistoryFile, file_name, parquet_files, widest
 from multidrop.history.units import unit_texts_of
 from multidrop.polling.batch import Rows
@@ -29,11 +37,12 @@ WITH_UNITS = """
 create temp view with_units as select recorded.*, unit from recorded left join units using (drive, register)
 """
 ROWS = "select * from with_units order by drive, time"
-TENS = """
-select to_timestamp(epoch_ns(time) // 10000000000 * 10) as time, drive, register, unit, count(value) as n,
-    count(*) - count(value) as missed, min(value) as least, avg(value) as mean, max(value) as most,
-    arg_max(value, monotonic_ns) as last
-from {} group by all order by drive, register, time
+TENS = f"""
+select to_timestamp(epoch_ns(time) // 10000000000 * 10) as time, drive, register, unit,
+    count({FINITE}) as n, count(*) - count({FINITE}) as missed,
+    min({FINITE}) as least, avg({FINITE}) as mean, max({FINITE}) as most,
+    arg_max({FINITE}, monotonic_ns) as last
+from {{}} group by all order by drive, register, time
 """
 MERGED = "select * exclude filename from {} order by drive, register, time"
 MERGED_ROWS = "select * exclude filename from {} order by drive, time"

@@ -21,6 +21,8 @@ TABLE = (
     "create temp table recorded (time timestamptz_ns, monotonic_ns bigint, uncertainty_ns bigint,"
     " drive varchar, register varchar, value double, status varchar)"
 )
+# A value for buckets: one infinite value would make the mean of its bucket infinite.
+FINITE = "case when isfinite(value) then value end"
 FORM = "format parquet, compression zstd"
 
 

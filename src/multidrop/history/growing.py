@@ -6,6 +6,7 @@ import threading
 from array import array
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
+from math import isfinite
 from pathlib import Path
 from typing import NamedTuple
 
@@ -139,7 +140,9 @@ class GrowingSegment:
         columns = self._tail.again(self._batches[number].place)
         for at in _places(columns, _codes(columns.drives, columns.registers, series)):
             name = columns.drives[columns.drive[at]], columns.registers[columns.register[at]]
-            yield SeriesRow(name, columns.time[at], columns.value[at] if _is_set(columns.valid, at) else None)
+            value = columns.value[at]
+            is_known = _is_set(columns.valid, at) and isfinite(value)
+            yield SeriesRow(name, columns.time[at], value if is_known else None)
 
     def _gather_tens(self, found: Mapping[Series, Accumulator], grid: Grid) -> None:
         if len(self._tens) > MOST_TENS:
@@ -210,7 +213,7 @@ MOST_SERIES = 4096  # limit of cached series; requested series without rows coun
 
 
 class SeriesRow(NamedTuple):
-    """A row of a series; the value None is a failed read."""
+    """A row of a series; the value None is a failed read, or a value that is not finite."""
 
     series: Series
     time: int  # UTC in ns

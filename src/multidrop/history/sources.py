@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 
 from multidrop.history.buckets import Grid, UnitBuckets
 from multidrop.history.database import (
+    FINITE,
     Database,
     copy_out,
     files_of,
@@ -188,7 +189,7 @@ _UNITS = f"""
 select filename, drive, register, unit
 from {{files}} where {_IN_RANGE}{{condition}} and unit is not null group by all order by max(epoch_ns(time))
 """
-OF_ROWS = "count(value), count(*) - count(value), sum(value), min(value), max(value)"
+OF_ROWS = f"count({FINITE}), count(*) - count({FINITE}), sum({FINITE}), min({FINITE}), max({FINITE})"
 OF_TENS = "sum(n)::bigint, sum(missed)::bigint, sum(mean * n), min(least), max(most)"
 
 
