@@ -439,7 +439,9 @@ def test_the_simulate_command_serves_a_line_of_a_plant_over_modbus_tcp(tmp_path:
 
 
 @pytest.mark.long
-def test_the_simulate_command_serves_a_local_port_under_its_own_name(tmp_path: Path, run: Run) -> None:
+def test_the_simulate_command_serves_a_local_port_under_its_name_in_the_file(
+    tmp_path: Path, run: Run
+) -> None:
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = f"tcp://127.0.0.1:{free.getsockname()[1]}"
     plant = tmp_path / "plant.toml"

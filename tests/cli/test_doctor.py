@@ -66,7 +66,7 @@ def test_the_doctor_command_reports_no_adapter_on_a_pty(run: Run, port: str) -> 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("port", ["socket://127.0.0.1:0"], indirect=True)
-def test_the_doctor_command_says_that_the_adapter_of_a_socket_is_far_away(run: Run, port: str) -> None:
+def test_the_doctor_command_says_that_the_adapter_of_a_socket_is_at_the_far_end(run: Run, port: str) -> None:
     status, told = examined(run, port)
     assert status == 0
     assert "is a TCP connection" in told
@@ -88,7 +88,9 @@ def test_an_rs485_mode_is_accepted_only_for_a_device(run: Run, port: str) -> Non
 @pytest.mark.slow
 @pyserials_own
 @pytest.mark.parametrize("port", ["socket://127.0.0.1:0"], indirect=True)
-def test_the_doctor_command_says_that_the_adapter_of_a_pyserial_port_is_far_away(run: Run, port: str) -> None:
+def test_the_doctor_command_says_that_the_adapter_of_a_pyserial_port_is_at_the_far_end(
+    run: Run, port: str
+) -> None:
     server = SerialServer(port)
     status, out, _ = run("doctor", server.url)
     server.close()

@@ -390,10 +390,7 @@ class Drive(RegisterAccess):
         return self.link.perform(self, script)
 
     def begin_call(self, verb: str, seen: int) -> Any:
-        """Register a call of a verb, so that a later stop can cancel it.
-
-        `seen` is the number of stops that were called before this call.
-        """
+        """Register a call, so that a later stop can cancel it; `seen` stops were called before this call."""
         return self.link.begin_call(self, verb, seen)
 
     def carry_out_move(self, script: Script[Any], call: Any) -> Any:
@@ -483,10 +480,7 @@ class Drive(RegisterAccess):
 
     @verb
     def identify(self) -> Script[None]:
-        """Check that the drive is of this family, if it has registers that show this.
-
-        Raises WriteForbidden if their values show another family.
-        """
+        """Check the drive's family, if registers show it. Raises WriteForbidden for another family."""
         yield from ()
 
     def resembles(self) -> Script[bool]:
@@ -541,10 +535,7 @@ class Drive(RegisterAccess):
 
     @verb
     def release_control(self) -> Script[None]:
-        """Return control of the motor to the drive's panel or terminals, if the family has such a command.
-
-        This is allowed only at rest.
-        """
+        """At rest, return control of the motor to the panel or terminals, if the family has this command."""
         raise self._unsupported("release_control command")
         yield
 
@@ -577,10 +568,7 @@ def check_drive(drive: Drive) -> None:
 
 
 def check_own(drive: Drive, register: Register[Any]) -> None:
-    """Raise ValueError for a register of another family: its address has another meaning in this family.
-
-    Raises TypeError if `register` is not a Register, for example if it is a name.
-    """
+    """Raise ValueError for a register of another family, TypeError if `register` is not a Register."""
     check_drive(drive)
     if not isinstance(register, Register):
         hint = "pass attributes of the drive, or drive.register(NAME), as separate arguments"
