@@ -110,7 +110,7 @@ def test_a_total_has_an_outage_while_the_value_of_another_line_is_too_old(
     assert outage.seconds == 40 - known_until_s
 
 
-def test_run_hours_and_number_of_starts_are_computed() -> None:
+def test_the_run_hours_and_the_number_of_starts_are_computed() -> None:
     declared = Channel("hours", "integral(frequency > 0)", "h"), Channel("starts", "count(frequency > 0)")
     made = channels(*declared, frequency="Hz")
     # the motor turns from the beginning, which does not count as a start

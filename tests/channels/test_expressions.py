@@ -198,7 +198,7 @@ def test_a_unit_suggested_by_the_error_is_accepted(expression: str, unit: str, v
         ("W/m²", "kW/m2", 0.001),
     ],
 )
-def test_values_are_converted_by_the_factor_between_their_units(one: str, other: str, factor: float) -> None:
+def test_each_value_is_converted_by_the_factor_between_its_units(one: str, other: str, factor: float) -> None:
     assert unit_of(one).is_like(unit_of(other))
     assert unit_of(one).factor / unit_of(other).factor == pytest.approx(factor, rel=1e-12)
 

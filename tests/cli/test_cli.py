@@ -287,7 +287,7 @@ def test_advice_for_a_drive_in_a_plant_refers_to_the_plant_file(run: Run, tmp_pa
     assert "P0.04: write maximum_frequency = HZ below its [[line.drive]]" in err
 
 
-def test_advice_for_programs_is_converted_for_the_command_line() -> None:
+def test_the_advice_for_programs_is_converted_for_the_command_line() -> None:
     reset = WriteForbidden(
         "x has a fault: remove its cause, then call reset_fault()", advice=Advice.call("reset_fault")
     )

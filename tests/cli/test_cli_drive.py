@@ -59,7 +59,7 @@ def test_the_read_command_prints_all_readings_and_settings_with_units(run: Run, 
         ({"LC_MESSAGES": "ru_RU", "LC_ALL": "en_US"}, ""),
     ],
 )
-def test_titles_are_printed_in_the_language_of_the_environment(
+def test_the_titles_are_printed_in_the_language_of_the_environment(
     run: Run, port: str, monkeypatch: pytest.MonkeyPatch, variables: dict[str, str], title: str
 ) -> None:
     monkeypatch.delenv("LC_ALL")
@@ -98,7 +98,7 @@ def test_the_read_command_prints_values_as_json(run: Run, port: str) -> None:
         ("status", 0x1101, "RUNNING, bit 8, bit 12", ["RUNNING", "bit 8", "bit 12"]),
     ],
 )
-def test_values_and_bits_without_names_are_shown_as_numbers(
+def test_a_value_or_bit_without_a_name_is_shown_as_a_number(
     run: Run, port: str, toy: SimulatedDrive, name: str, raw: int, shown: str, value: list[str] | None
 ) -> None:
     for cell in toy.memory.of(Toy.registers[name]):
@@ -297,7 +297,7 @@ def test_a_start_is_confirmed_on_a_terminal_or_not_sent(
     assert len(toy.counters.writes) == writes
 
 
-def test_input_typed_before_the_question_does_not_answer_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_input_typed_before_the_question_does_not_answer_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """An impatient user may have typed a second "y" as an answer to the previous question."""
     terminal, program = os.openpty()
 

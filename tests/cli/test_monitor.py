@@ -563,7 +563,7 @@ def test_the_monitor_ends_only_after_a_running_stop(
 @pytest.mark.parametrize(
     "keys", ["joksy", "\u043e\u0442\u043b\u044b\u043d", "\u043e\u0442\u043b\u0456\u043d"]
 )
-def test_keys_are_the_same_in_cyrillic_layouts(screened: Screened, keys: str) -> None:
+def test_the_keys_are_the_same_in_cyrillic_layouts(screened: Screened, keys: str) -> None:
     screened.press(keys)  # down (j), a key without a function (o), up (k), stop (s), yes (y)
     assert screened.poller.asked == ["drive-1 control STOP"]
 

@@ -83,7 +83,7 @@ def test_each_picture_replaces_the_last_and_is_removed_at_the_end(monkeypatch: p
         (b"\x1bOSy\x1b[1;2S\x1b[[As\x1b[a\x1bOq", [UNKNOWN, "y", UNKNOWN, UNKNOWN, "s", UNKNOWN, UNKNOWN]),
     ],
 )
-def test_keys_whose_bytes_arrive_together_are_separated(pressed: bytes, told: list[str]) -> None:
+def test_the_keys_whose_bytes_arrive_together_are_separated(pressed: bytes, told: list[str]) -> None:
     found = []
     while pressed:
         key, pressed = next_key(pressed)

@@ -226,7 +226,7 @@ def test_a_name_with_markup_is_plain_text_in_pictures_and_legends(tmp_path: Path
     assert plot_page(look, figure)
 
 
-def test_texts_in_a_capture_are_printed_without_control_characters(run: Run, tmp_path: Path) -> None:
+def test_the_texts_in_a_capture_are_printed_without_control_characters(run: Run, tmp_path: Path) -> None:
     exchanges = [each for each in PRINTED if each.framing is Framing.RTU and isinstance(each.says, Message)]
     path = write(
         tmp_path / "it.pcapng",
@@ -305,7 +305,7 @@ address = 1
 
 
 @pytest.mark.parametrize("words", [["plan"], ["plan", "--json"]])
-def test_letters_that_the_encoding_lacks_are_printed_as_escapes(
+def test_a_letter_that_the_encoding_lacks_is_printed_as_an_escape(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str]
 ) -> None:
     plant, out = tmp_path / "plant.toml", BytesIO()
@@ -325,7 +325,7 @@ ODD = ["1_0", "\uff11\uff12", "\u0663", "\u0967\u0968", "\U0001d7cf", "\u00bd", 
 
 
 @table("text", [*ODD, "", "-", "0x10", "0b1", "1 2", "1,5"])
-def test_texts_without_plain_decimal_digits_are_not_parsed_as_numbers(text: str) -> None:
+def test_a_text_without_plain_decimal_digits_is_not_parsed_as_a_number(text: str) -> None:
     for parse in (plain_number, plain_whole):
         with pytest.raises(ValueError, match="in decimal digits"):
             parse(text)

@@ -455,7 +455,7 @@ def test_the_timing_diagrams_are_up_to_date(monkeypatch: pytest.MonkeyPatch) -> 
         assert (DOCS / "pictures" / f"{name}.svg").read_text("utf-8") == diagrams.draw(name)
 
 
-def test_timing_diagram_text_fits_its_box(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_text_of_a_timing_diagram_fits_its_box(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(DOCS / "pictures"))
     diagrams = importlib.import_module("diagrams")
     for name in diagrams.DIAGRAMS:
@@ -522,7 +522,7 @@ def revision(text: str) -> str:
 
 
 @of_each_page
-def test_translation_has_the_headings_list_items_and_code_blocks_of_its_page(
+def test_a_translation_has_the_headings_list_items_and_code_blocks_of_its_page(
     language: str, page: str
 ) -> None:
     assert PARTS.findall(translation(language, page)) == PARTS.findall(ENGLISH[page])
@@ -537,11 +537,11 @@ def test_each_translated_section_has_the_names_and_figures_of_the_english_one(
 
 
 @of_each_page
-def test_translation_names_the_present_revision_of_its_page(language: str, page: str) -> None:
+def test_a_translation_names_the_present_revision_of_its_page(language: str, page: str) -> None:
     assert f"<!-- translates revision {revision(ENGLISH[page])} -->" in translation(language, page)
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/before-you-connect-a-motor.md"])
-def test_english_page_links_its_translations_at_its_top(page: str) -> None:
+def test_each_english_page_links_its_translations_at_its_top(page: str) -> None:
     top = (ROOT / page).read_text("utf-8").partition("\n\n##")[0]
     assert all(re.search(rf"\]\((docs/)?{language}/", top) for language in TRANSLATED)

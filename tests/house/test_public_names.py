@@ -80,7 +80,7 @@ def test_a_family_is_declared_with_public_names() -> None:
 # ---- repr in a debugger ----
 
 
-def test_repr_of_drive_and_bus_shows_name_address_and_port() -> None:
+def test_the_repr_of_a_drive_or_bus_shows_name_address_and_port() -> None:
     drive = Toy(3, name="pump-3")
     assert repr(drive) == "<Toy 'pump-3', address 3, rtu, 9600 8N1, not attached>"
     with Bus("loop://") as bus:
@@ -91,11 +91,11 @@ def test_repr_of_drive_and_bus_shows_name_address_and_port() -> None:
     assert repr(bus) == "<Bus loop://, closed: pump-3>"
 
 
-def test_repr_of_batch_shows_counts_and_time_span() -> None:
+def test_the_repr_of_a_batch_shows_counts_and_time_span() -> None:
     assert repr(example()) == "<Batch: 5 rows of 3 drives, 3.000 s from 2026-11-21T09:30:00.123+00:00>"
 
 
-def test_repr_of_poller_shows_its_state() -> None:
+def test_the_repr_of_a_poller_shows_its_state() -> None:
     poller = Poller(Plant((), Path()))
     assert repr(poller) == "<Poller not started; no lines>"
     poller.close()

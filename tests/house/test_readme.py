@@ -62,7 +62,7 @@ def test_the_bench_extra_installs_all_that_benchmarks_import() -> None:
     assert imported - ours - set(sys.stdlib_module_names) - installed == set()
 
 
-def test_setup_commands_in_readme_equal_those_of_ci_run() -> None:
+def test_the_setup_commands_in_the_readme_equal_those_of_ci_run() -> None:
     patterns = re.findall(r"grep -m1 -E '([^']+)' README\.md", (ROOT / ".ci" / "run").read_text("utf-8"))
     found = [next(line for line in README.splitlines() if re.search(pattern, line)) for pattern in patterns]
     assert sorted(found) == sorted(SETTING_UP)
@@ -121,7 +121,7 @@ def test_every_example_is_linked_and_tested(path: Path) -> None:
 
 
 @pytest.mark.long
-def test_logger_example_records_to_parquet(tmp_path: Path) -> None:
+def test_the_logger_example_records_to_parquet(tmp_path: Path) -> None:
     pytest.importorskip("pyarrow")
     run(tmp_path, "logger.py", "--seconds", "1")
     rows = [row for batch in open_recording(tmp_path / "log.parquet") for row in batch]
@@ -159,7 +159,7 @@ def test_the_example_with_two_lines_polls_both_lines(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_pump_example_stops_its_motor_when_the_program_ends(tmp_path: Path) -> None:
+def test_the_pump_example_stops_its_motor_when_the_program_ends(tmp_path: Path) -> None:
     printed = run(tmp_path, "pump.py", "1")
     assert "failed" not in printed
     assert printed.splitlines()[-1] == "the output frequency is now 0.0 Hz"
@@ -169,7 +169,7 @@ def test_pump_example_stops_its_motor_when_the_program_ends(tmp_path: Path) -> N
 
 
 @pytest.mark.long
-def test_noise_hunt_example_finds_bad_checksums(tmp_path: Path) -> None:
+def test_the_noise_hunt_example_finds_bad_checksums(tmp_path: Path) -> None:
     # patient.py, which other tests use, sets long timeouts: here each lost reply would wait for them
     printed = run(tmp_path, "noise_hunt.py", "5", through=())
     assert "pump-1: " in printed

@@ -132,7 +132,7 @@ def upwards(path: Path, modules: set[str]) -> set[str]:
 
 
 @pytest.mark.long
-def test_dir_lists_public_names_before_their_modules_are_imported() -> None:
+def test_the_function_dir_lists_public_names_before_their_modules_are_imported() -> None:
     assert set(multidrop.__all__) <= set(dir(multidrop))
 
 
@@ -302,7 +302,7 @@ def test_pure_files_of_the_c_core_make_no_system_calls() -> None:
 
 
 @pytest.mark.long
-def test_python_calls_each_function_of_the_core_s_public_headers() -> None:
+def test_each_public_function_of_the_core_is_called_from_python() -> None:
     headers = "".join((ROOT / "csrc" / f"{name}.h").read_text("utf-8") for name in HEADERS_OF_PYTHON)
     declared = set(CALLED.findall(re.sub(r"/\*.*?\*/", "", headers, flags=re.DOTALL)))
     called = {
@@ -374,7 +374,7 @@ def test_each_step_of_a_walkthrough_names_existing_code(walk: Path) -> None:
     assert missing(walk) == []
 
 
-def test_step_of_a_walkthrough_that_names_missing_code_is_detected(tmp_path: Path) -> None:
+def test_a_step_of_a_walkthrough_that_names_missing_code_is_detected(tmp_path: Path) -> None:
     walk = tmp_path / "walk.md"
     walk.write_text("`poller.py:Poller.take_off`, `nowhere.c`, `poller.py:Poller`, `csrc/line.c`")
     assert missing(walk) == ["poller.py:Poller.take_off", "nowhere.c:"]

@@ -126,7 +126,7 @@ async def late_values(backend: str, framer: str) -> tuple[int, int, int]:
 
 
 @pytest.mark.skipif(find_spec("modbus_connection") is not None, reason="modbus-connection is installed")
-def test_error_without_modbus_connection_says_what_to_install() -> None:
+def test_the_error_without_modbus_connection_says_what_to_install() -> None:
     with pytest.raises(ImportError, match=r"needs Python 3\.12 or newer .* modbus-connection: pip install"):
         import_module("multidrop.modbus_connection")
 

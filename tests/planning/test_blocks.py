@@ -460,7 +460,7 @@ class Mixed(Drive):
     other = reading(4, table=INPUT)
 
 
-def test_tables_that_are_read_by_the_same_function_share_requests() -> None:
+def test_two_tables_with_the_same_read_function_share_requests() -> None:
     drive = Mixed(1)
     found = blocks(drive, drive.registers.values())
     assert [(one.request.function, one.start, one.count) for one in found] == [(3, 1, 3), (4, 4, 1)]

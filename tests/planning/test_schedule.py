@@ -111,7 +111,7 @@ def test_every_poll_is_sent_on_an_overloaded_line() -> None:
         assert counts[each] + each.skipped == pytest.approx(slots, abs=1)
 
 
-def test_polls_without_a_period_continue_when_an_overload_starts() -> None:
+def test_a_poll_without_a_period_continues_when_an_overload_starts() -> None:
     made = schedule(turn := job(1, duration_ms=10))
     take(made, 0, 10_000)  # requests sent before the overload starts
     for drive in (2, 3):
@@ -120,14 +120,14 @@ def test_polls_without_a_period_continue_when_an_overload_starts() -> None:
     assert taken.count(turn) >= 3000 / 10 * TURN_SHARE - 6
 
 
-def test_polls_without_a_period_do_not_save_up_unused_time() -> None:
+def test_a_poll_without_a_period_does_not_save_up_unused_time() -> None:
     made = schedule(job(1, 10, duration_ms=10))
     take(made, 0, 10_000)
     made.add(turn := job(2, duration_ms=10), 10_000 * MS)
     assert [each for each, _ in take(made, 10_000, 100)].count(turn) <= 1
 
 
-def test_polls_with_equal_line_settings_are_sent_in_a_row_if_none_is_late() -> None:
+def test_the_polls_with_equal_line_settings_are_sent_in_a_row_if_none_is_late() -> None:
     jobs = [job(drive, 210, duration_ms=10, kind=drive % 2) for drive in range(1, 21)]
     done = carry_out(schedule(*jobs), 20)
     switches = sum(one.kind != other.kind for (one, _, _), (other, _, _) in pairwise(done))
@@ -143,7 +143,7 @@ def test_an_urgent_poll_goes_before_polls_with_the_present_line_settings() -> No
     assert one.skipped == 0
 
 
-def test_polls_without_a_period_are_sent_one_after_another() -> None:
+def test_the_polls_without_a_period_are_sent_one_after_another() -> None:
     jobs = [job(drive) for drive in range(5)]
     made = schedule(*jobs)
     assert [each for each, _ in take(made, 0, 35)] == [*jobs, *jobs[:2]]
@@ -331,7 +331,7 @@ def test_a_silent_drive_is_retried_once_after_a_late_reply() -> None:
     assert [each for each, _ in take(made, 100, 60)].count(poll) == 1
 
 
-def test_polls_with_the_present_line_settings_go_first_if_time_permits() -> None:
+def test_a_poll_with_the_present_line_settings_goes_first_if_time_permits() -> None:
     """If the time is a nanosecond too short, the job whose slot ends first is sent first."""
     for less, order in ((0, [2, 1]), (1, [1, 2])):
         made = schedule(job(3, 1000, 10, kind=2))
@@ -385,7 +385,7 @@ def test_polling_of_a_drive_does_not_pause_after_one_failure() -> None:
     assert take(made, 0, 5) == [(poll, 0)]
 
 
-def test_polls_of_a_silent_drive_are_reported_with_the_time_they_were_due() -> None:
+def test_every_poll_of_a_silent_drive_is_reported_with_its_due_time() -> None:
     made = schedule(poll := job(1, period_ms=100))
     fail(made, 1, 2, now_ms=0)
     assert take(made, 0, 350) == []

@@ -123,7 +123,7 @@ def mistakes(load: Load, tmp_path: Path) -> Mistakes:
     return mistakes
 
 
-def test_lines_drives_and_polls_are_read_from_a_plant_file(load: Load) -> None:
+def test_the_lines_drives_and_polls_are_read_from_a_plant_file(load: Load) -> None:
     plant = load(GOOD)
     hall_1, hall_2 = plant.lines
     assert (hall_1.name, hall_1.port, hall_1.baudrate, hall_1.format) == (

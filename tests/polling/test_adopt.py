@@ -342,7 +342,7 @@ def test_an_absent_port_of_a_new_plant_is_opened_when_it_exists() -> None:
         check_rates(made, 2, fan_1=0.1)
 
 
-def test_add_line_raises_if_the_port_is_absent() -> None:
+def test_a_line_with_an_absent_port_cannot_be_added() -> None:
     with clocked(hall(*pumps())) as made:
         made.run(1)
         del made.wires["port of yard"]

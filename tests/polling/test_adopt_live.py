@@ -173,7 +173,7 @@ def test_a_drive_that_is_being_removed_cannot_be_started_after_its_stop(both: Tw
         assert not runs(both.pumps[2])
 
 
-def test_stop_on_exit_applies_to_a_line_that_is_being_opened(
+def test_the_setting_stop_on_exit_applies_to_a_line_that_is_being_opened(
     both: TwoLines, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with Poller(plant(both.hall())) as poller:

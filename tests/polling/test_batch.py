@@ -47,7 +47,7 @@ def test_an_empty_batch_has_no_rows() -> None:
 
 
 @table("places", [[], [0], [4, 1], [0, 1, 2, 3, 4], [2, 2] * 9])
-def test_batch_at_returns_the_rows_at_the_given_indices(places: list[int]) -> None:
+def test_the_method_at_returns_the_rows_at_the_given_indices(places: list[int]) -> None:
     wanted = [EXAMPLE[place] for place in places]
     found = example().at(places)
     assert list(found) == wanted

@@ -437,7 +437,7 @@ def test_the_rate_of_a_silent_drive_can_be_changed() -> None:
         assert {values(made.run(10))["pump-2", register.name] for register in ALL} <= {49, 50, 51}
 
 
-def test_rates_can_be_set_before_polling_starts() -> None:
+def test_the_rates_can_be_set_before_polling_starts() -> None:
     pump = toy()
     made = clocked(polled(pump, ALL, 0.1))
     made.poller.set_rate(pump, CURRENT, 1.0)

@@ -525,7 +525,7 @@ def test_batches_end_when_the_poller_is_closed(poller: Poller) -> None:
     assert len(rows) == counted(poller)
 
 
-def test_on_batch_rejects_invalid_functions(poller: Poller) -> None:
+def test_an_invalid_function_is_refused_by_on_batch(poller: Poller) -> None:
     with pytest.raises(TypeError, match="on_batch takes a function with one argument, the batch, not 3"):
         poller.on_batch(3)  # type: ignore[arg-type]
     with poller:

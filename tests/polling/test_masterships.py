@@ -368,7 +368,9 @@ def test_the_first_request_after_a_new_mastership_waits_the_guard_time(mastershi
 
 
 @pytest.mark.slow
-def test_ports_open_and_close_without_pauses(mastership: Mastership, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_port_opens_and_closes_without_a_pause(
+    mastership: Mastership, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """pyserial's own sockets sleep for 0.3 s when they are closed, which would take 19 s for 64 sockets."""
     pauses_s: list[float] = []
     monkeypatch.setattr(protocol_socket, "time", SimpleNamespace(sleep=pauses_s.append))
@@ -386,7 +388,7 @@ def test_ports_open_and_close_without_pauses(mastership: Mastership, monkeypatch
     assert pauses_s == []
 
 
-def test_removing_lines_concurrently_waits_for_each_request_in_flight(
+def test_lines_that_are_removed_together_wait_for_each_request_in_flight(
     mastership: Mastership, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A gateway that loses its lease has only half a second to close all of its lines."""
@@ -427,7 +429,7 @@ class Busy:
 
 
 @table(("left_ns", "waited_ns"), [(0, S), (S // 5, S // 5), (-S, 0), (5 * S, S)])
-def test_closing_a_poller_waits_for_a_request_until_the_mastership_ends(
+def test_a_closing_poller_waits_for_a_request_until_its_mastership_ends(
     monkeypatch: pytest.MonkeyPatch, left_ns: int, waited_ns: int
 ) -> None:
     """The mastership ends after `left_ns`; with 0 the process holds no mastership."""

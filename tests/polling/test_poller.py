@@ -561,7 +561,7 @@ def responder() -> Iterator[tuple[int, str]]:
 
 
 @pytest.mark.parametrize("every", [None, 1.0], ids=["in turn", "at a rate"])
-def test_closing_a_poller_waits_for_exchanges_in_flight(
+def test_a_poller_closes_only_after_the_exchanges_in_flight(
     responder: tuple[int, str], every: float | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     master, path = responder
@@ -690,7 +690,7 @@ def test_a_recording_poller_of_31_drives_uses_at_most_30_mb() -> None:
 
 
 @pytest.mark.long
-def test_closing_waits_for_the_stalled_adapters_of_all_lines_together(
+def test_a_closing_poller_waits_for_all_stalled_adapters_together(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Each adapter has the same 0.75 s from the end of polling, not 0.75 s after the previous one."""
