@@ -95,7 +95,8 @@ def test_drives_of_a_plant_file_can_be_read_written_and_stopped_by_modbus(tmp_pa
             assert client.receive() is None
         sent = [(one.name, one.raw) for one in drive.counters.writes]
         assert ("setpoint", 5000) in sent
-        assert {raw for name, raw in sent if name == "control"} == {5}
+        # 5 stops the motor; if the reply to it is late, the gateway also sends 8, which ends a jog
+        assert {raw for name, raw in sent if name == "control"} in ({5}, {5, 8})
     audit = list(read_audit(tmp_path / "audit.jsonl"))
     assert any("modbus from 127.0.0.1" in str(entry) and "setpoint" in str(entry) for entry in audit)
 

@@ -251,9 +251,13 @@ def test_a_stop_method_called_on_the_wrong_object_still_stops_its_drive(
     assert "stop" in stop(client, "")
     # With the limit 0, the server answers as if the limit of concurrent stops were reached.
     monkeypatch.setattr("multidrop.control.commands.MOST_STOPS", 0)
+    stops = gateway.gateway.commands.stops
+    earlier = stops["pump-1"]
     with pytest.raises(ua.UaStatusCodeError, match="BadMethodInvalid"):
         other.call_method(stop_1)
+    until(lambda: stops["pump-1"] == earlier + 1)
     assert stop(client, "pump-1") == "the stop is in progress"
+    until(lambda: stops["pump-1"] == earlier + 2)
 
 
 @pytest.mark.slow
