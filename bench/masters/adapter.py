@@ -99,7 +99,7 @@ def multidrop(
 
 @contextmanager
 def leased(job: Job) -> Iterator[Callable[[], tuple[int, int]]]:
-    """Poll like `multidrop`, but with a mastership: the core then checks the clock before each request."""
+    """Poll like `multidrop`, but with a mastership: the C core then checks the clock before each request."""
     mastership = Mastership()
     mastership.extend(time.clock_gettime_ns(time.CLOCK_BOOTTIME) + LEASE_NS)
     try:
@@ -164,7 +164,7 @@ def decoder(drives: int) -> Callable[[], Batch]:
 
     def decode() -> Batch:
         columns = Columns(BATCH_ROWS)
-        add, into = lib.md_columns_add, columns.c  # called directly from C, as the core's own thread does
+        add, into = lib.md_columns_add, columns.c  # called directly from C, as the C core's own thread does
         for block, found in turns[: BATCH_ROWS // REGISTERS]:
             add(into, block.c, found, 0)
         return Batch(columns, *names)

@@ -126,7 +126,7 @@ def in_turn(
             while time.monotonic() < end:
                 address = 1 + asked % job.drives
                 asked += 1
-                with suppress(Exception):  # each rival has its own error classes
+                with suppress(Exception):  # each library has its own error classes
                     good += list(read(address)) == expected(address)
             return good, asked - good
 

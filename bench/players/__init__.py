@@ -1,1 +1,1 @@
-"""Players: programs that simulate lines and drives, and clients to be attacked."""
+"""Players: programs that simulate lines and drives, and client programs under test."""

@@ -1,4 +1,4 @@
-"""A client to be attacked: it reads one command per line, and reports each result with its time."""
+"""A client program for tests of stops. It reads one command per line, and reports results with times."""
 
 from __future__ import annotations
 

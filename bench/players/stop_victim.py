@@ -1,4 +1,4 @@
-"""The client process and the responders of one attack, and the counters of the stops' results."""
+"""A client process on simulated lines, for tests of its stops, and the counters of the results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Columns that the core fills from replies, and the memory of the structs that each exchange uses."""
+"""Columns that the C core fills from replies, and the memory of the structs that each exchange uses."""
 
 from __future__ import annotations
 

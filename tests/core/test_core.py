@@ -599,7 +599,7 @@ def test_each_exchange_that_is_counted_before_a_port_closes_has_a_row() -> None:
 
 
 def wait_until_it_sleeps(thread: threading.Thread) -> None:
-    """Wait until the thread sleeps in the core."""
+    """Wait until the thread sleeps in the C core."""
     stat = Path(f"/proc/self/task/{thread.native_id}/stat")
     asleep = 0
     while asleep < 20:
@@ -837,7 +837,7 @@ def test_opening_and_closing_a_thousand_ports_leaks_no_descriptor(drive: Drive) 
             port.submit(queued, [0])
         return len(list(Path("/dev/fd").iterdir()))
 
-    before = come_and_go(0)  # opens the descriptors that the core keeps
+    before = come_and_go(0)  # opens the descriptors that the C core keeps
     assert {come_and_go(start) for start in range(1, 1000)} == {before}
 
 

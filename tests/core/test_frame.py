@@ -411,7 +411,7 @@ def crc(data: bytes) -> int:
     [
         (CHECK, 0x4B37),  # CRC-16/MODBUS in the catalogue of parametrised CRC algorithms
         (b"", 0xFFFF),
-        (bytes.fromhex("01 04 00 01 00 05"), 0xC961),  # ERMAN, E1: 61 C9 on the wire
+        (bytes.fromhex("01 04 00 01 00 05"), 0xC961),  # manual of ERMAN ER-G-220; on the wire 61 C9
         (bytes.fromhex("01 06 20 01 13 88"), 0x9CDE),  # INNOVERT IBD, appendix 2
         (bytes.fromhex("01 03 01 F4 00 01"), 0x04C4),  # Delixi, part 2
         (bytes.fromhex("02 07"), 0x1241),  # serial-line guide V1.02, 6.2.2

@@ -270,7 +270,7 @@ def test_a_late_reply_is_expected_after_a_lost_port_is_reopened(line: LineDriver
 def test_a_polled_value_has_the_first_requests_time_if_it_may_be_late(
     line: LineDriver, drive: Peer, is_row: bool
 ) -> None:
-    """A read by `Bus` gets no value yet: the core must first be sure that no late reply is due."""
+    """A read by `Bus` gets no value yet: the C core must first be sure that no late reply is due."""
     drive.prove_by([exchange(LONGER, drive), exchange(Message(1, 3, 0, 3), drive)])
     rows = RowLayout(0, [Field(0, NumberFormat.U16, 0, 1.0, 1.0)]) if is_row else None
     asked = exchange(READ, drive, block=rows)

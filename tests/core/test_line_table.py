@@ -71,7 +71,7 @@ def test_the_request_is_written_only_after_a_check_for_silence() -> None:
 
 
 class Walk:
-    """A line of the core on which random events happen in random order."""
+    """A line of the C core on which random events happen in random order."""
 
     def __init__(self, seed: int) -> None:
         self.chance = random.Random(seed)

@@ -1,6 +1,6 @@
-"""Serial settings on a descriptor; the core's thread, which drives all ports, and its realtime scheduling.
+"""Serial settings on a descriptor; the C core's thread, which drives all ports, and its realtime scheduling.
 
-A pty accepts any baud rate, but always has 8 bits without parity. Only the core's thread has realtime
+A pty accepts any baud rate, but always has 8 bits without parity. Only the C core's thread has realtime
 scheduling, and only if the user wants it and the system permits it.
 """
 
@@ -163,7 +163,7 @@ def policies() -> dict[int, int]:
 
 @pytest.fixture
 def realtime() -> Iterator[Realtime]:
-    """Yield a client for which the core's thread has realtime scheduling."""
+    """Yield a client for which the C core's thread has realtime scheduling."""
     client = Realtime()
     try:
         client.want(True)
@@ -189,7 +189,7 @@ def test_only_the_cores_thread_is_scheduled_in_real_time(realtime: Realtime) -> 
     assert policies()[core] & os.SCHED_FIFO
     second.want(False)
     assert not policies()[core] & os.SCHED_FIFO
-    assert not second.has_ended()  # the client switched realtime scheduling off, not the core
+    assert not second.has_ended()  # the client switched realtime scheduling off, not the C core
 
 
 @pytest.fixture
@@ -272,7 +272,7 @@ def locked_kb() -> int:
 
 @SHOWS_SCHEDULING
 def test_the_cores_code_is_locked_in_memory(realtime: Realtime) -> None:
-    assert 64 < locked_kb() < 4096  # kB: the core's library, but not the whole process
+    assert 64 < locked_kb() < 4096  # kB: the C core's library, but not the whole process
     realtime.want(False)
     assert locked_kb() == 0
 
@@ -315,7 +315,7 @@ process.flush_log(10)
 @SHOWS_SCHEDULING
 @pytest.mark.long
 def test_a_flood_ends_realtime_scheduling(realtime: Realtime, caplog: pytest.LogCaptureFixture) -> None:
-    """The core's thread discards bytes that a program sends as fast as the computer can."""
+    """The C core's thread discards bytes that a program sends as fast as the computer can."""
     near, far = socket.socketpair()
     near.setblocking(False)
     flood = [sys.executable, "-c", f"import os\nwhile True: os.write({far.fileno()}, bytes(1000))"]

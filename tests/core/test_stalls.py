@@ -177,7 +177,7 @@ def test_a_stop_does_not_wait_for_a_read_that_waits_for_a_stalled_adapter(ends: 
 
 @pytest.mark.long
 def test_a_reply_after_a_stall_is_not_taken_for_the_reply_to_the_next_read(ends: Ends, port: Port) -> None:
-    """The device has no proofs, and the stall is longer than the window of late replies."""
+    """The stall is longer than the time for which late replies are expected."""
     adapter, peer = ends[1], Peer(least_timeout=0.2, most_timeout=0.2)
 
     def answer(value: bytes) -> bytes:
@@ -220,7 +220,7 @@ def test_a_broadcast_command_is_not_written_to_a_stalled_adapter(port: Port) -> 
 
 
 def test_a_broadcast_command_does_not_wait_for_late_replies(free_port: Port) -> None:
-    peer = Peer(least_timeout=TIMEOUT_S, most_timeout=PATIENCE)  # PATIENCE is also the window of late replies
+    peer = Peer(least_timeout=TIMEOUT_S, most_timeout=PATIENCE)  # late replies are expected for PATIENCE
     start, set_all = (exchange(message, peer=peer, baudrate=9600) for message in (START, SET_ALL))
     assert free_port.carry_out(start).result == Failure.NO_REPLY
     assert free_port.carry_out(start).result == Failure.LATE_ANSWER_DUE

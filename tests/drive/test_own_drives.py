@@ -64,7 +64,7 @@ class Pump(Fan):
 
 
 class Known(Pump):
-    """A drive with `identify`."""
+    """A drive that a register identifies."""
 
     kind = reading(0x40)
     control = command(0x30, Word, harmless=(Word.STOP,))

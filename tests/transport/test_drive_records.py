@@ -195,7 +195,7 @@ class Mode(IntEnum):
 
 
 class Mixed(Drive):
-    """A drive with registers that the core decodes and others that it cannot."""
+    """A drive with registers that the C core decodes and others that it cannot."""
 
     model = "mixed"
     title = "MIXED"
@@ -225,7 +225,7 @@ FIRST, WORDS = 1, 27
 
 
 def expected(data: bytes) -> dict[str, Any]:
-    """Return the values of this data, computed with `struct` instead of the core."""
+    """Return the values of this data, computed with `struct` instead of the C core."""
     tenths, celsius, energy, low, high, power = struct.unpack_from(">HhIHHf", data)
     pulses, drift, mode, perhaps, balance, flow, power_of_ten = struct.unpack_from(">QqHHiHh", data, 18)
     part, digits, fine = struct.unpack_from(">HHI", data, 46)

@@ -1,7 +1,7 @@
 """A late reply is never taken for the reply to another request.
 
-If a late reply could be mistaken for a request's reply, the core sends a probe first. A probe (`proof` in the
-code) is a read whose reply no late reply can resemble. The last tests reopen a port to which late replies
+If a late reply could be mistaken for a request's reply, the C core sends a probe first. A probe (`proof` in
+the code) is a read whose reply no late reply can resemble. The last tests reopen a port to which late replies
 come, in this process or after another one.
 """
 

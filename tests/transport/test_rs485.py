@@ -148,7 +148,7 @@ def test_a_failure_to_switch_rts_loses_the_port_and_ends_sending(driver: Path) -
 def test_a_poller_raises_immediately_if_rts_cannot_be_switched(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(open_port, "is_pseudo_terminal", lambda device: False)
     with Simulator([Wire([simulated(Toy(1))])]) as sim:
-        Bus(sim.wires[0].path).close()  # starts the core's thread, which then continues to run
+        Bus(sim.wires[0].path).close()  # starts the C core's thread, which then continues to run
         before = descriptors(), threads()
         drive = polled(Toy(1), [Toy.output_current])
         declared = replace(line(sim.wires[0].path, drive), rs485=RS485.RTS_UP)

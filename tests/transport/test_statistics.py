@@ -197,7 +197,7 @@ def test_the_statistics_of_a_time_span_are_a_difference_of_two_readings() -> Non
 def test_the_longest_delay_of_a_time_span_is_derived_from_the_buckets() -> None:
     early, late = counters_of([50 * MS]), counters_of([50 * MS, 8 * MS])
     found = line_of(2, pump=late).since(line_of(1, pump=early)).delays
-    assert 8e-3 <= found.longest <= 8e-3 * 9 / 8  # the end of the bucket that has 8 ms
+    assert 8e-3 <= found.longest <= 8e-3 * 9 / 8  # upper edge of the bucket for 8 ms
     record = counters_of([50 * MS, 8 * MS, 70 * MS])
     assert line_of(2, pump=record).since(line_of(1, pump=early)).delays.longest == 0.070
 

@@ -48,7 +48,7 @@ def as_numbers(data: Any, kind: str) -> memoryview:
 
 
 class GivenColumns(Columns):
-    """Columns with given arrays, in place of the core's."""
+    """Columns with given arrays, in place of the C core's."""
 
     def __init__(self, columns: dict[str, memoryview]) -> None:
         self._columns = columns

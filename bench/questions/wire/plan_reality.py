@@ -88,7 +88,10 @@ def case(name: str, port: str, wanted: Wanted, seconds: float) -> Case:
 
 
 def middle(times: Sequence[int]) -> float:
-    """Return the usual period of times in ns, as seconds: the median of the means of all seconds."""
+    """Return the usual interval in s between these times in ns.
+
+    Each second has a mean interval; the result is the median of these means.
+    """
     most = len(times) - 1
     step = min(most, max(1, round(1e9 * most / (times[-1] - times[0]))))
     return median(times[at + step] - times[at] for at in range(0, most - step + 1, step)) / step / 1e9
@@ -142,7 +145,7 @@ def mixed(seconds: float) -> Iterator[Case]:
 
 @contextmanager
 def simulated(drives: Iterable[tuple[str, Drive]]) -> Iterator[str]:
-    """Yield the port of a line on which `multidrop simulate` plays these drives."""
+    """Yield the port of a line on which `multidrop simulate` simulates these drives."""
     with TemporaryDirectory() as directory:
         plant = Path(directory) / "plant.toml"
         entries = (
