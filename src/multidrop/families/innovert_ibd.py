@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from enum import IntEnum, IntFlag
+from typing import Any
 
 from multidrop.drive import Advice, BusError, Drive, DriveException, Framing, WriteForbidden
+from multidrop.drive.declaration_check import DeclarationError
 from multidrop.drive.options import Option
 from multidrop.drive.parameters import ParameterGroup, ParameterSpace
-from multidrop.drive.register import HOLDING, command, reading, setting
+from multidrop.drive.register import HOLDING, Register, command, reading, setting
 from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.verbs import Script, insist, read, verb, write
 
@@ -94,6 +97,14 @@ class IBDFormat(IntEnum):
     RTU_8N1 = 3
     RTU_8E1 = 4
     RTU_8O1 = 5
+
+
+# registers that a sibling declares: the meaning of 0, the step that a code needs, and its words
+OF_STATE = {
+    "run_state": ("at rest", 1, ", and its step is 1"),
+    "output_frequency": ("at rest", 0, ""),
+    "fault": ("without a fault", 1, ", and its step is 1"),
+}
 
 
 class InnovertIBD(Drive):
@@ -219,6 +230,23 @@ class InnovertIBD(Drive):
         place="2001H, table 3",
         note="Used if Prb.01 = 5.",
     )
+
+    def __init_subclass__(cls) -> None:
+        """Raise DeclarationError if a sibling's registers of the state do not suit `state` and `stop`."""
+        if wrong := cls.role_mistakes(vars(cls)):
+            raise DeclarationError(cls.__name__, wrong)
+        super().__init_subclass__()
+
+    @classmethod
+    def role_mistakes(cls, own: Mapping[str, Any]) -> list[str]:
+        """Return a sentence for each of these registers whose value may be 0 although its count is not 0."""
+        found = {name: own[name] for name in OF_STATE if isinstance(own.get(name), Register)}
+        return [
+            f"{name}: it is 0 only {meaning}: it has no part, offset or scale_register{codes}"
+            for name, one in found.items()
+            for meaning, step, codes in [OF_STATE[name]]
+            if one.part or one.offset or one.scale_register or (step and one.step not in (step, None))
+        ]
 
     def needed_silence(self) -> float:
         return super().needed_silence() if self.framing is Framing.RTU else 0.0

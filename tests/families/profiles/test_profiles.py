@@ -71,6 +71,13 @@ WRONG: list[tuple[type[Drive], dict[str, Any], str]] = [
     (Acs355, {"status": reading(3, number_format=NumberFormat.I16)}, "status: it is one word of bits"),
     (Acs355, {"control": command(0, table=COIL)}, "control: "),
     (Acs355, {"reference": setting(1, "%", step=-0.005)}, "reference: a greater count must mean more"),
+    (
+        Acs355,
+        {"reference": setting(1, "%", number_format=NumberFormat.I16)},
+        "reference: a reference below 0",
+    ),
+    (VfdEl, {"fault": reading(9, step=0.1)}, "fault: it is a code"),
+    (VfdEl, {"fault": reading(9, offset=-5)}, "fault: it is a code"),
     (Atv320, {"sleeve": command(9, harmless=(1,))}, "sleeve: only control has harmless counts"),
     (Atv320, {"output_frequency": reading(9, "Hz", part=(0, 3))}, "output_frequency: it is 0 only at rest"),
     (Atv320, {"output_frequency": reading(9, "Hz", offset=-50)}, "output_frequency: it is 0 only at rest"),

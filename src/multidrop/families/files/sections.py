@@ -500,7 +500,25 @@ def _proof(table: Any, registers: Mapping[str, Register[Any]], place: TomlPlace)
         if len(place.config_errors) == before:
             place.wrong("says no value; add is = [0x010A], or above and below")
         return None
-    return Proof(name, tuple(values), good.get("above", -inf), good.get("below", inf))
+    proof = Proof(name, tuple(values), good.get("above", -inf), good.get("below", inf))
+    if why := _proves_nothing(proof, registers[name]):
+        place.wrong(f"{why}; give values of {name} that other drives do not have")
+        return None
+    return proof
+
+
+def _proves_nothing(proof: Proof, register: Register[Any]) -> str:
+    """Return why this proof accepts every device, or none; "" if it accepts only some."""
+    if register.scale_register:  # its values depend on another register
+        return ""
+    coding = register.coding
+    least, most = sorted(float(end * register.scale + coding.offset) for end in coding.raw_span)
+    values = [value for value in proof.values if least <= value <= most and proof.holds(value)]
+    if not (proof.above < proof.below and proof.above < most and proof.below > least):
+        return "no value is above and below these limits"
+    if proof.values and not values:
+        return f"is = {shown([*proof.values])} has no value that the register can hold within the limits"
+    return "" if proof.values or proof.above >= least or proof.below <= most else "every value is accepted"
 
 
 def identify_by(proofs: Sequence[Proof]) -> Verb[[], None]:

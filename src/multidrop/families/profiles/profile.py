@@ -74,12 +74,20 @@ def own_errors(
         yield f"{name}: reserved name; every profile has it for something else; rename the register"
     elif register.harmless:
         yield f"{name}: only control has harmless counts, and the profile states them; leave them out"
-    if name == "reference" and register.span is not None and register.span[0] < 0:
+    if name == "reference" and (register.span or register.coding.raw_span)[0] < 0:
         yield f"{name}: a reference below 0 may turn the motor the other way; its span begins at 0"
     if name == "reference" and ((register.step or 0) < 0 or register.offset):
         yield f"{name}: a greater count must mean more: its step must be above 0, and it has no offset"
     if name == "output_frequency" and (register.part or register.offset or register.scale_register):
         yield f"{name}: it is 0 only at rest: it has no part, offset or scale_register"
+    if name == "fault":
+        yield from code_errors(register)
+
+
+def code_errors(register: Register[Any]) -> Iterator[str]:
+    """Yield an error if this register is not a code, such as a fault's, of which only 0 has value 0."""
+    if register.step not in (1, None) or register.offset or register.scale_register:
+        yield f"{register.name}: it is a code: it has no step, offset or scale_register"
 
 
 def errors_together(roles: Mapping[str, Role], found: Mapping[str, Any]) -> Iterator[str]:
