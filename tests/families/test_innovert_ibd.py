@@ -10,6 +10,7 @@ from tables import table
 
 from multidrop.drive import Condition, Direction, DriveException, Framing, Unconfirmed, WriteForbidden
 from multidrop.drive.register import HOLDING
+from multidrop.errors import NoReply
 from multidrop.families.innovert_ibd import (
     FrequencySource,
     IBDBaudrate,
@@ -108,7 +109,25 @@ def test_innovert_ibd_reset_and_setpoint_0_send_the_documented_frames() -> None:
     wire = Wire(InnovertIBD(1), STANDING)
     wire.drive.reset_fault()
     wire.drive.set_frequency(0)
-    assert wire.sent == [STOP[Framing.RTU], RESET, ZERO]
+    assert wire.sent == [STOP[Framing.RTU], RESET, STOP[Framing.RTU], ZERO]
+
+
+def test_innovert_ibd_reset_bit_is_cleared_although_the_reset_is_unconfirmed() -> None:
+    """A reset bit that stays set could reset a later fault unseen."""
+    wire = Wire(InnovertIBD(1), STANDING, {RESET: [Unconfirmed("drive", "reset", "no reply")]})
+    with pytest.raises(Unconfirmed):
+        wire.drive.reset_fault()
+    assert wire.sent == [STOP[Framing.RTU], RESET, STOP[Framing.RTU]]
+
+
+def test_innovert_ibd_is_not_started_if_a_missing_reply_hides_how_it_shows_a_fault() -> None:
+    faulty = {**STANDING, **PROGRAMMED, "terminals": Terminals.VIRTUAL, "output_m02": NoReply("drive")}
+    wire = Wire(InnovertIBD(1), faulty)
+    wire.drive.set_frequency(50)
+    with pytest.raises(NoReply):
+        wire.drive.start()
+    assert wire.sent == [FIFTY[Framing.RTU]]
+    wire.drive.stop()  # confirmed by speed and current
 
 
 def test_innovert_ibd_gets_a_stop_before_the_fault_reset() -> None:

@@ -128,6 +128,7 @@ SHEETS = {
         ((0x2000, 0x02),),
         ((0x2000, 0x01),),
         (0x2000, 0x10),
+        after_reset=((0x2000, 0x01),),
     ),
     # Source: the public program stand_drive.py. PA02 is the frequency, PA27 the fault and PA28 the state;
     # Pb01 = 5 and Pb02 = 2.
@@ -140,6 +141,7 @@ SHEETS = {
         ((0x2000, 0x02),),
         ((0x2000, 0x01),),
         (0x2000, 0x10),
+        after_reset=((0x2000, 0x01),),
     ),
     # Delixi protocol, part 2: no reset is documented, and at 0 Hz the motor may run at a setpoint of 0.
     "delixi-modbus": Sheet(

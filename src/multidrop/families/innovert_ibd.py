@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from enum import IntEnum, IntFlag
 from typing import Any
 
-from multidrop.drive import Advice, BusError, Drive, DriveException, Framing, WriteForbidden
+from multidrop.drive import Advice, BusError, Drive, DriveException, Framing, Unconfirmed, WriteForbidden
 from multidrop.drive.declaration_check import DeclarationError
 from multidrop.drive.options import Option
 from multidrop.drive.parameters import ParameterGroup, ParameterSpace
@@ -361,8 +362,9 @@ class InnovertIBD(Drive):
         yield from insist(self.control, IBDControl.STOP)
         limit = (yield from read(self.deceleration_time)) + STOP_MARGIN
         look = self._is_at_rest
-        if not self._has_state and (yield from self._programmed()):
-            look = self._is_off
+        with suppress(BusError):
+            if not self._has_state and (yield from self._programmed()):
+                look = self._is_off
         yield from self._stopped(look, limit)
 
     def _is_off(self) -> Script[bool]:
@@ -385,11 +387,19 @@ class InnovertIBD(Drive):
 
     @verb
     def reset_fault(self) -> Script[None]:
-        """Reset a fault after a stop. It never starts the motor, and the reset is sent once."""
+        """Reset a fault after a stop; never starts the motor. The reset is sent once.
+
+        A second stop clears the reset bit, because a bit that stayed set could reset a later fault.
+        """
         if not (yield from self._is_at_rest()):
             raise WriteForbidden(f"{self.name} turns: it has no fault to reset")
         yield from insist(self.control, IBDControl.STOP)
-        yield from write(self.control, IBDControl.RESET_FAULT)
+        try:
+            yield from write(self.control, IBDControl.RESET_FAULT)
+        except (Unconfirmed, DriveException):
+            yield from insist(self.control, IBDControl.STOP)
+            raise
+        yield from insist(self.control, IBDControl.STOP)
 
     @verb
     def set_frequency(self, hz: float) -> Script[None]:
@@ -439,7 +449,7 @@ class InnovertIBD(Drive):
             ):
                 if (yield from read(register)) != function:
                     return False
-        except BusError:
+        except DriveException:
             return False
         return True
 
