@@ -24,11 +24,11 @@ REQUEST_9600 = 9 * 10 / 9600  # s: 8 characters of the request, and the first ch
 @pytest.fixture(scope="module", autouse=True)
 def _imported() -> None:
     """Import matplotlib only when these tests run. At collection, it would cost each worker 0.5 s."""
-    global np, Recording, load, report_page
+    global np, Recording, TimeSpan, load, report_page
     global MOST_REASONS, delays, draw_rates, miss_shares, reasons_of, line_uses
     import numpy as np
 
-    from multidrop.report import Recording, load, report_page
+    from multidrop.report import Recording, TimeSpan, load, report_page
     from multidrop.report.health import MOST_REASONS, delays, draw_rates, line_uses, miss_shares, reasons_of
 
 
@@ -55,6 +55,28 @@ def test_the_duration_of_a_recording_does_not_change_if_the_clock_is_set(
     times = [(at + set_by_s * (at > 49), at) for at in range(100)]
     rows = [Row(UTC_0 + t * SECOND, at * SECOND, 1000, "pump", "speed", 1.0, "ok") for t, at in times]
     assert load(record(tmp_path / "a.arrows", rows, ABOUT)).seconds == 99
+
+
+@pytest.mark.parametrize("set_by_s", [0, -5, -3600])
+def test_a_fault_during_which_the_clock_is_set_back_has_the_right_duration(
+    tmp_path: Path, set_by_s: int
+) -> None:
+    """The fault lasts from 8 s to 13 s, and the clock is set at 10 s."""
+    rows = []
+    for at in range(30):
+        utc, value = at + set_by_s * (at >= 10), 8.0 if 8 <= at < 13 else 0.0
+        rows.append(Row(UTC_0 + utc * SECOND, at * SECOND, 1000, "pump", "fault", value, "ok"))
+    (pump,) = load(record(tmp_path / "a.arrows", rows, ABOUT)).series
+    assert pump.faults() == [TimeSpan(UTC_0 + 8 * SECOND, UTC_0 + 13 * SECOND, "OVERHEAT")]
+
+
+def test_the_duration_of_a_recording_by_several_computers_is_by_the_time_of_day(tmp_path: Path) -> None:
+    rows = [
+        Row(UTC_0 + at * SECOND, (uptime + at) * SECOND, 1000, drive, "speed", 1.0, "ok")
+        for drive, uptime in (("pump", 100), ("fan", 3_000_000))
+        for at in range(60)
+    ]
+    assert load(record(tmp_path / "a.arrows", rows, ABOUT)).seconds == 59
 
 
 def test_the_duration_of_a_recording_includes_restarts_of_the_computer(tmp_path: Path) -> None:

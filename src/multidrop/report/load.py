@@ -35,7 +35,7 @@ LARGEST = 1e150  # larger values are not drawn, because matplotlib multiplies va
 # The time between two rows is a pause if it is longer than PAUSE_NS, and longer than PAUSE_STEPS times the
 # interval before it and PAUSE_STEPS times the interval after it.
 PAUSE_NS, PAUSE_STEPS = 2 * 10**9, 5
-RESTART_NS = 10 * 10**9  # the monotonic clock goes back by more than this only if the computer restarts
+SET_NS = 10**9  # the time of day was set, or the computer slept, if two clocks differ by more than this
 MOST_ROWS = 100_000_000  # limit of a recording's rows, which then take 5 GB of memory
 MOST_NAMES = 4096  # limit of the number of different names: of drives, of registers, and of statuses
 
@@ -68,6 +68,7 @@ class Series:
     value: Array  # float64
     uncertainty: Array  # float64, ns
     status: Array  # each row's status, as an index into `statuses`
+    place: Array  # each row's place in the recording
     statuses: tuple[str, ...]
     metadata: Mapping[str, Any]  # metadata of the register
 
@@ -115,17 +116,21 @@ class Series:
 
     def faults(self) -> list[TimeSpan]:
         """Return the time spans in which this fault register was not 0. Missed values do not end a span."""
-        there = ~self.missed
+        in_order = np.argsort(self.place)
+        there = in_order[~self.missed[in_order]]
         time, value = self.time[there], self.value[there]
         if not len(time):
             return []
+        # if the time of day is set back, only the monotonic clock shows how long a fault lasts
+        steps = np.maximum(np.diff(time), np.diff(self.monotonic[there])).clip(0)
+        since = np.append(0, np.cumsum(steps))
         changes = np.flatnonzero(value[1:] != value[:-1]) + 1
         begins = [0, *changes.tolist()]
         ends = [*changes.tolist(), len(time) - 1]
         return [
-            TimeSpan(int(time[begin]), int(time[end]), self.name_of(value[begin]))
-            for begin, end in zip(begins, ends, strict=True)
-            if value[begin] != 0
+            TimeSpan(int(time[at]), int(time[at] + since[end] - since[at]), self.name_of(value[at]))
+            for at, end in zip(begins, ends, strict=True)
+            if value[at] != 0
         ]
 
     def name_of(self, value: float) -> str:
@@ -152,7 +157,7 @@ class Recording:
     path: Path
     metadata: Mapping[str, Any]
     series: tuple[Series, ...]
-    seconds: float  # duration, without the time that the computer slept
+    seconds: float  # duration; without the time that the computer slept
     truncated: int  # number of skipped bytes at the recording's end
     steps: tuple[StepSpan, ...] = ()  # steps of a test run, named by their phases
     events: tuple[Event, ...] = ()  # in the order of their times
@@ -247,6 +252,7 @@ def load(path: str | Path) -> Recording:
                 value[rows_of].astype(float),
                 uncertainty[rows_of].astype(float),
                 status[rows_of],
+                rows_of,
                 statuses,
                 about,
             )
@@ -262,20 +268,25 @@ def load(path: str | Path) -> Recording:
     if trigger := trigger_of(metadata):
         events.add(trigger)
     in_order = sorted(events, key=lambda event: event.time)
-    seconds = _seconds(time, monotonic)
+    series_of_row = drive.astype(np.int64) * len(registers) + register
+    seconds = _seconds(series_of_row, time, monotonic)
     return Recording(Path(path), metadata, polled, seconds, reader.truncated, tuple(steps), tuple(in_order))
 
 
-def _seconds(time: Array, monotonic: Array) -> float:
-    """Return the duration of a recording in s. `time` and `monotonic` are its rows' times in ns.
+def _seconds(series: Array, time: Array, monotonic: Array) -> float:
+    """Return the duration of a recording in s. The arrays have each row's series, and its times in ns.
 
-    It is measured by the monotonic clock, because the time of day may be set meanwhile. Only the time of a
-    restart of the computer, which also restarts the monotonic clock, is measured by the time of day.
+    If the time of day was set meanwhile, or if the computer slept, return the longest duration of a series by
+    the monotonic clock. This clock goes back only if the computer restarts.
     """
-    back, ahead = np.diff(monotonic) < -RESTART_NS, np.diff(time - monotonic) > RESTART_NS
-    starts = np.flatnonzero(back & ahead) + 1
-    awake = sum(int(part.max()) - int(part.min()) for part in np.split(monotonic, starts))
-    return (awake + int(np.diff(time)[starts - 1].clip(0).sum())) / 1e9
+    in_order = np.argsort(series, kind="stable")
+    is_same = np.diff(series[in_order]) == 0
+    utc, awake = np.diff(time[in_order]), np.diff(monotonic[in_order])
+    if not (is_same & (awake >= 0) & (np.abs(utc - awake) > SET_NS)).any():
+        return (int(time.max()) - int(time.min())) / 1e9
+    steps = np.append(0, np.where(is_same, np.where(awake < 0, utc.clip(0), awake), 0))
+    starts = np.append(0, np.flatnonzero(~is_same) + 1)
+    return int(np.add.reduceat(steps, starts).max()) / 1e9
 
 
 def _steps(phases: Series, end: tuple[int, int]) -> list[StepSpan]:
