@@ -1,7 +1,7 @@
 // The view of active and ended alarms: faults, motors that stopped without a command, lost ports, silent
 // drives.
 
-import { readAlarms } from "../data/history.js";
+import { endOf, readAlarms } from "../data/history.js";
 import { now } from "../data/link.js";
 import { isLive, store } from "../data/store.js";
 import { pieces, said, t } from "../texts.js";
@@ -107,9 +107,10 @@ function acknowledgement({ acknowledged, by, note }) {
 const acknowledgeButton = alarm =>
   make("button", { type: "button", onclick: () => acknowledge(alarm) }, t("Acknowledge"));
 
-function trendLink({ drive, time, ended }) {
+function trendLink(alarm) {
+  const { drive, time } = alarm;
   if (!drive) return null;
-  const [from, to] = [Math.floor(time - AROUND_MS), Math.ceil((ended ?? now()) + AROUND_MS)];
+  const [from, to] = [Math.floor(time - AROUND_MS), Math.ceil(endOf(alarm) + AROUND_MS)];
   return make(
     "a",
     { href: `#/trends?drive=${encodeURIComponent(drive)}&from=${from}&to=${to}` },
