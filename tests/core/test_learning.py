@@ -267,7 +267,7 @@ def test_a_late_reply_is_expected_after_a_lost_port_is_reopened(line: LineDriver
 
 
 @pytest.mark.parametrize("is_row", [True, False], ids=["for a row", "for a client"])
-def test_a_polled_value_has_the_first_requests_time_if_it_may_be_late(
+def test_a_polled_value_that_may_be_late_has_the_time_of_the_first_request(
     line: LineDriver, drive: Peer, is_row: bool
 ) -> None:
     """A read by `Bus` gets no value yet: the C core must first be sure that no late reply is due."""

@@ -259,7 +259,7 @@ def test_bytes_received_before_the_request_is_sent_are_not_its_reply(line: LineD
 
 
 @pytest.mark.parametrize("step", ["silent", "listening"])
-def test_a_failed_port_ends_the_exchange_as_line_lost(line: LineDriver, step: str) -> None:
+def test_an_exchange_on_a_failed_port_has_the_status_line_lost(line: LineDriver, step: str) -> None:
     line.begin(exchange(READ))
     if step == "listening":
         line.wait_until_write()

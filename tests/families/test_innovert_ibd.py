@@ -97,7 +97,7 @@ def test_innovert_ibd_terminal_bits_have_the_documented_names() -> None:
 
 
 @table("framing", InnovertIBD.framings)
-def test_each_innovert_ibd_verb_sends_the_printed_frame(framing: Framing) -> None:
+def test_each_innovert_ibd_command_sends_the_frame_in_the_manual(framing: Framing) -> None:
     wire = Wire(InnovertIBD(1, framing=framing), {**STANDING, "terminals": Terminals(0)}, turns=TURNS)
     wire.drive.set_frequency(50)
     wire.drive.start()

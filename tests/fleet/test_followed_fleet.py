@@ -411,7 +411,7 @@ def looked(made: FleetView) -> dict[str, Any]:
     return made.fleet()
 
 
-def test_a_line_owned_by_an_ended_session_is_shown_without_a_master() -> None:
+def test_a_line_of_a_gateway_that_has_ended_is_shown_without_a_master() -> None:
     found = looked(view())
     assert {name: line["master"] for name, line in found["lines"].items()} == {
         "line-1": "gw-1",

@@ -258,7 +258,7 @@ def test_utilisation_counts_requests_outside_the_plan(planned: dict[str, Any], t
 
 
 @pytest.mark.parametrize("wrong", [None, [], "hall", {"hall-1": 7}, {"hall-1": {"drives": {"pump": {}}}}])
-def test_a_recordings_invalid_plan_is_ignored(turns: list[Row], tmp_path: Path, wrong: Any) -> None:
+def test_an_invalid_plan_in_a_recording_is_ignored(turns: list[Row], tmp_path: Path, wrong: Any) -> None:
     look = load(record(tmp_path / "it.arrows", turns, ABOUT | {"planned": wrong}))
     assert line_uses(look) == []
 

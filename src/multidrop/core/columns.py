@@ -187,7 +187,7 @@ def _packed(extra: Extra) -> dict[str, Any]:
 
 
 class RowLayout:
-    """The fields in the reply of one exchange (struct md_block); `drive` is the code of the drive's name."""
+    """The fields in the reply to one request. `drive` is the number that stands for the drive's name."""
 
     def __init__(self, drive: int, fields: Sequence[Field]) -> None:
         self._fields, self._extra = _shared(tuple(fields))

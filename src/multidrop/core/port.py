@@ -485,7 +485,7 @@ class Port:
         return int(lib.md_port_counted_ns(self.c))
 
     def inherit(self, peer: Peer, before: Peer) -> None:
-        """Let `peer` also expect late replies to requests of `before`, the earlier drive at its address."""
+        """Expect late replies to requests of `before` too: an earlier drive at the same address."""
         self._memory.lasting.update((peer, before))
         lib.md_port_inherit(self.c, peer.c, before.c)
 

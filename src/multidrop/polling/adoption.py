@@ -237,10 +237,8 @@ class Adoption:
     def _change(self) -> dict[str, LineError]:
         """Change the lines that keep their ports, one by one; return the errors of ports, by line name.
 
-        A drive name must be free before a line gets a new drive of this name. Therefore a line from which a
-        drive of this name is removed is changed earlier. If lines wait for each other in a circle, all of
-        them are changed together, after their stops have ended. New ports are opened later, because a slow
-        port must not delay a stop.
+        If a drive's name moves from one line to another, the first of these two lines is changed first. Lines
+        that wait for each other in a circle are changed together, after their stops have ended.
         """
         failures: dict[str, LineError] = {}
         names = {polled.drive.name for polled in self._plant.drives}

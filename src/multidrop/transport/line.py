@@ -352,7 +352,7 @@ class Line:
         return self._opened.settings if self._opened.bridge else None
 
     def inherit(self, peer: Peer, before: Peer) -> None:
-        """Let `peer` also expect late replies to requests of `before`, the earlier drive at its address."""
+        """Expect late replies to requests of `before` too: an earlier drive at the same address."""
         with self._lock:
             if self.queue:
                 self.queue.inherit(peer, before)

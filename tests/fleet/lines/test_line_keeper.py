@@ -269,7 +269,7 @@ async def test_a_line_of_a_dead_master_is_claimed_by_writing_two_records() -> No
 
 
 @pytest.mark.parametrize("place", [0, 1])
-async def test_a_bucket_without_a_leader_does_not_delay_a_claim(place: int) -> None:
+async def test_a_line_is_claimed_although_one_nats_bucket_has_no_leader(place: int) -> None:
     trial = DeadTrial()
     await trial.read_and_begin()
     trial.buckets[place].is_down = True

@@ -265,7 +265,7 @@ def topics_of(kind: str) -> list[str]:
     return [node["topic"] for node in FLOW if node["type"] == kind]
 
 
-def test_the_gateway_publishes_or_subscribes_each_topic_of_the_node_red_flow(tmp_path: Path) -> None:
+def test_the_gateway_uses_each_topic_of_the_node_red_flow(tmp_path: Path) -> None:
     matches = require_module("paho.mqtt.client").topic_matches_sub
     topics = JsonTopics(MqttSettings(commands=True), inside(tmp_path), lambda: 7)
     topics.outbox = noted = Noted()
