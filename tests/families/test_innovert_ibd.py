@@ -9,7 +9,8 @@ from simulated_bus import one
 from tables import table
 
 from multidrop.drive import Condition, Direction, DriveException, Framing, Unconfirmed, WriteForbidden
-from multidrop.drive.register import HOLDING
+from multidrop.drive.declaration_check import DeclarationError
+from multidrop.drive.register import HOLDING, reading
 from multidrop.errors import NoReply
 from multidrop.families.innovert_ibd import (
     FrequencySource,
@@ -324,3 +325,17 @@ def test_innovert_ibd_registers_with_inferred_addresses_are_never_written() -> N
     inferred = {name for name, each in InnovertIBD.registers.items() if 200 <= each.address < 0x2000}
     assert inferred <= never
     assert never - inferred == {"frequency_source", "run_source", "stored_frequency"}
+
+
+@table(
+    ("register", "mistake"),
+    [
+        ({"run_state": reading(300, step=0.1)}, "it is 0 only at rest"),
+        ({"fault": reading(300, part=(0, 0))}, "it is 0 only without a fault"),
+    ],
+)
+def test_a_sibling_of_the_ibd_needs_a_state_that_is_0_only_at_rest(
+    register: dict[str, object], mistake: str
+) -> None:
+    with pytest.raises(DeclarationError, match=mistake):
+        type("Sibling", (InnovertIBD,), register)

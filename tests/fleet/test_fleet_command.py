@@ -130,7 +130,7 @@ LISTS = {
     '[fleet.may]\nwrite = ["pump-hall-1.speed"]': "has no register 'speed'",
     '[fleet.may]\nwrite = ["frequency"]': "write: 'frequency' is not right; write write = [",
     '[fleet.may]\nwrite = "pump-hall-1.frequency"': "write = 'pump-hall-1.frequency' is not right",
-    '[fleet.may]\nverbs = ["pump-hall-1.stop"]': "'stop' of pump-hall-1 is not a verb that can be",
+    '[fleet.may]\nverbs = ["pump-hall-1.stop"]': "'stop' of pump-hall-1 cannot be allowed; choose from start",
     '[fleet.may]\nverbs = ["fan.start"]': "verbs: there is no drive 'fan'",
     '[fleet.may]\nverb = ["pump-hall-1.start"]': "verb",
     '[fleet.can]\nverbs = ["pump-hall-1.start"]': "can",

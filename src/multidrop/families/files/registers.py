@@ -244,18 +244,18 @@ ADDRESS: Mapping[str, Any] = {
 NAME: Mapping[str, Any] = {"maxLength": LONGEST_NAME, "pattern": f"^{_NAME.pattern}$"}
 _COUNT = {"type": "integer"}
 _COUNTS = {"type": "array", "items": _COUNT, "maxItems": MOST_LISTED}
-_FINITE = {"type": "number", "minimum": -sys.float_info.max, "maximum": sys.float_info.max}
-_NUMBER_OR_NAN = {"anyOf": [_FINITE, {"enum": ["NaN", "nan"]}]}
+FINITE = {"type": "number", "minimum": -sys.float_info.max, "maximum": sys.float_info.max}
+_NUMBER_OR_NAN = {"anyOf": [FINITE, {"enum": ["NaN", "nan"]}]}
 _NUMBERS = {"type": "array", "items": _NUMBER_OR_NAN, "minItems": 1, "maxItems": MOST_COUNTS}
 _TEXT = {"type": "string", "maxLength": LONGEST_TEXT, "pattern": r"^[^\x00-\x1f\x7f]*$"}
 # JSON Schema of a key's values, by the function that converts them
 _SCHEMAS: Mapping[Callable[[Any], Any], Mapping[str, Any]] = {
     _any: ADDRESS,
     _text: _TEXT,
-    _number: _FINITE,
+    _number: FINITE,
     _truth: {"type": "boolean"},
-    _step: {"anyOf": [{**_FINITE, "not": {"const": 0}}, {"const": NOT_STATED}]},
-    _span: {"type": "array", "items": _FINITE, "minItems": 2, "maxItems": 2, **ASCENDING},
+    _step: {"anyOf": [{**FINITE, "not": {"const": 0}}, {"const": NOT_STATED}]},
+    _span: {"type": "array", "items": FINITE, "minItems": 2, "maxItems": 2, **ASCENDING},
     _counts: _COUNTS,
     _invalid: {"anyOf": [_NUMBER_OR_NAN, _NUMBERS]},
     _part: {

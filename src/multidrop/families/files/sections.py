@@ -22,7 +22,7 @@ from multidrop.drive.text import Text, text
 from multidrop.drive.verbs import Script, Verb, read, verb
 from multidrop.errors import WriteForbidden
 from multidrop.families.files.notation import TABLES, Counting
-from multidrop.families.files.registers import ADDRESS, BESIDE, WRITES, converted, shown, unusable
+from multidrop.families.files.registers import ADDRESS, BESIDE, FINITE, WRITES, converted, shown, unusable
 from multidrop.printable import is_number, is_whole
 from multidrop.toml_check import ASCENDING, Key, TomlPlace, duration_of, duration_up_to, json_schema
 
@@ -447,8 +447,8 @@ MOST_PROOFS = 20
 PROOF_KEYS = {
     "register": Key(str, 'register = "device"', needed=True),
     "is": Key(list, "is = [0x010A]", keywords={"items": {"type": "number"}}),
-    "above": Key((int, float), "above = 71.5"),
-    "below": Key((int, float), "below = 76.5"),
+    "above": Key((int, float), "above = 71.5", keywords=FINITE),
+    "below": Key((int, float), "below = 76.5", keywords=FINITE),
 }
 
 
