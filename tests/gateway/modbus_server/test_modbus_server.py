@@ -7,6 +7,7 @@ import struct
 import threading
 import time
 from collections.abc import Iterator
+from math import inf
 from typing import Any
 
 import pytest
@@ -567,7 +568,7 @@ def test_the_registers_common_to_all_drives_show_no_value_read_before_a_sleep(ga
     assert found[8:10] == [0xFFFF, 0xFFFE]  # the largest age that fits
 
 
-@table(("number", "expected"), [(5.0, 5), (None, 0xFFFE), (0.0, 0xFFFE)])
+@table(("number", "expected"), [(5.0, 5), (None, 0xFFFE), (0.0, 0xFFFE), (inf, 0xFFFE), (0.5, 0xFFFE)])
 def test_the_registers_common_to_all_drives_include_the_fault_number(
     gateway: Gateway, number: float | None, expected: int
 ) -> None:

@@ -291,7 +291,7 @@ class CommonBlock:
         if state != "fault":
             return NO_FAULT if state in ("stands", "runs") else FAULT_UNKNOWN
         value = self._fresh_value(hub, now_ns, woke_ns, "fault", "")
-        if value is None or value != int(value) or not 0 < value < FAULT_WITHOUT_NUMBER:
+        if value is None or not value.is_integer() or not 0 < value < FAULT_WITHOUT_NUMBER:
             return FAULT_WITHOUT_NUMBER
         return int(value)
 
