@@ -20,8 +20,8 @@ def _refuse_sub_interpreters() -> None:
             continue
         if interpreters.get_current() != interpreters.get_main():
             raise ImportError(
-                "multidrop works in a process's main interpreter only, and this is a sub-interpreter: "
-                "use it there, or in a process of its own"
+                "multidrop cannot be imported in a sub-interpreter. Import it in the process's main "
+                "interpreter, or in another process"
             )
         return
 

@@ -431,7 +431,9 @@ def _made(drive: D | type[D], address: int | None, line: dict[str, Any], details
             raise TypeError(f"attach({drive.__name__}, address=...): the address is missing")
         return drive(address, **{**line, **details})
     if address is not None or details:
-        raise TypeError(f"{drive.name} already exists: give its address and options to {family.__name__}(…)")
+        raise TypeError(
+            f"attach takes no address or options with a drive object; write them in {family.__name__}(…)"
+        )
     return drive
 
 
@@ -460,10 +462,10 @@ class Attached:
         """
         with self.lock:
             if not self._bus.is_open:
-                raise LineError(self._bus.line.port, f"its bus is closed: open a new one for {drive.name}")
+                raise LineError(self._bus.line.port, f"the bus is closed: attach {drive.name} to a new Bus")
             for other in self.drives:
                 if other.address == drive.address:
-                    raise ValueError(f"address {drive.address} is taken by {other.name}")
+                    raise ValueError(f"address {drive.address} is already used by {other.name} on this line")
             # `setdefault` is atomic: two buses cannot both take the drive
             owner = vars(drive).setdefault("bus", self._bus)
             if owner is not self._bus and owner.is_open:

@@ -394,7 +394,7 @@ def test_an_empty_time_resolution_option_of_pcapng_means_the_default(tmp_path: P
 
 def test_a_capture_with_a_huge_time_offset_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.pcapng").write_bytes(described((14, struct.pack("<q", 1 << 40))))
-    with pytest.raises(CaptureError, match=r"byte 28: its time offset of 1099511627776 s is too large"):
+    with pytest.raises(CaptureError, match=r"byte 28: the time offset of 1099511627776 s is too large"):
         spans(tmp_path / "a.pcapng")
 
 
@@ -432,7 +432,7 @@ BIG_ENDIAN_SECTION = struct.pack(">IIIHHqI", 0x0A0D0D0A, 28, 0x1A2B3C4D, 1, 0, -
         (SECTION + block(1, bytes(4)), " is damaged: at byte 28 a packet should start"),
         (
             described((9, b"\x0a")),
-            ": byte 28: its time stamps are finer than a nanosecond, and cannot be read",
+            ": byte 28: time stamps finer than a nanosecond cannot be read",
         ),
         (described() + packet(1, READ), NO_PACKET),  # the file has no interface 1
         (described() + packet(0, READ, stated=9), NO_PACKET),  # its stated length exceeds the block

@@ -200,4 +200,4 @@ def test_a_scan_with_two_family_files_that_declare_one_model_is_refused(run: Run
     found = [tmp_path / folder / "meter.toml" for folder in ("a", "b")]
     status, _, err = run("scan", "/dev/null", "--model", found[0], "--model", found[1])
     assert status == 2
-    assert "two files declare the model meter.toml: rename one" in err
+    assert "two family files declare the model meter.toml: name only one of them" in err

@@ -109,7 +109,7 @@ def test_the_help_imports_no_command_and_no_large_library() -> None:
         ),
         (
             ["read", "/dev/ttyX", TOY, "1", "control"],
-            f"control can only be written; see `multidrop models {TOY}`",
+            f"register control cannot be read; see `multidrop models {TOY}`",
         ),
         (
             ["read", "/dev/ttyX", TOY, "1", "--baudrate", "38400"],
@@ -201,7 +201,11 @@ def test_the_file_name_of_a_report_must_end_in_html(run: Run, tmp_path: Path) ->
 @table(
     ("name", "ports", "sentence"),
     [
-        ("hall/1", "ports", "line 'hall/1' has a / in its name: rename it to link its port"),
+        (
+            "hall/1",
+            "ports",
+            "--ports cannot name a file after line 'hall/1': rename the line to a name without /",
+        ),
         ("a", "plant.toml", "--ports plant.toml is a file: name a directory; it is created if missing"),
     ],
 )
@@ -216,7 +220,7 @@ def test_a_port_that_cannot_be_linked_is_refused(
 
 def test_a_missing_ledger_file_is_reported(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", "/state")
-    sentence = f"there is no ledger {tmp_path}/none; the default is /state/multidrop/wear.sqlite"
+    sentence = f"there is no EEPROM ledger {tmp_path}/none; the default file is /state/multidrop/wear.sqlite"
     assert run("wear", "--ledger", tmp_path / "none") == (2, "", f"multidrop: {sentence}\n")
 
 

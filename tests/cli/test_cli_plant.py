@@ -98,10 +98,16 @@ def test_a_command_uses_the_settings_in_the_plant_file(run: Run, plant: Path, at
         (["zz"], "PLANT has no drive 'zz'; there are pump-1, fan-1, che-1, pump-2"),
         ([], "choose a drive of PLANT: pump-1, fan-1, che-1, pump-2; see `multidrop read --help`"),
         (["pump-1", "output_curent"], "TOY T1 has no register 'output_curent'; did you mean output_current"),
-        (["pump-1", "control"], "control can only be written; see `multidrop models PLANT pump-1`"),
-        (["pump-1", "--baudrate", "9600"], "--baudrate is not for plant files: set it in PLANT"),
-        (["pump-1", "--option", "rated_frequency=50"], "--option is not for plant files"),
-        (["pump-1", "--ram", "sealed"], "--ram is not for plant files"),
+        (
+            ["pump-1", "control"],
+            "register control cannot be read; see `multidrop models PLANT pump-1`",
+        ),
+        (
+            ["pump-1", "--baudrate", "9600"],
+            "--baudrate cannot be used with a plant file. Write the setting in PLANT",
+        ),
+        (["pump-1", "--option", "rated_frequency=50"], "--option cannot be used with a plant file"),
+        (["pump-1", "--ram", "sealed"], "--ram cannot be used with a plant file"),
         (["pump-1", "--port", "hal-1=x"], "PLANT has no line 'hal-1'; did you mean hall-1?"),
         (["pump-1", "--port", "hall-1"], "argument --port: 'hall-1' is not LINE=PORT, such as"),
         (["pump-1", "--port", "hall-1="], "argument --port: 'hall-1=' is not LINE=PORT, such as"),
@@ -120,7 +126,9 @@ def test_a_mistaken_name_or_option_is_shown(run: Run, plant: Path, words: list[s
 
 
 def test_options_for_plant_files_are_refused_without_a_plant_file(run: Run) -> None:
-    sentence = "multidrop: --port is for a plant file; without a plant file, the first argument is the port\n"
+    sentence = (
+        "multidrop: --port needs a plant file. Without a plant file, give the port as the first argument\n"
+    )
     for words in (("read", "/dev/none", TOY, 1), ("scan", "/dev/none"), ("doctor", "/dev/none")):
         assert run(*words, "--port=a=b") == (2, "", sentence)
 
@@ -276,10 +284,12 @@ def test_the_doctor_command_uses_the_drives_of_a_plant(run: Run, plant: Path, po
     assert "round trip" in findings("hall-1")
     assert "not measured" not in findings("pump-1")["round trip"]
     assert "has no drive 'pump-7'; did you mean" in run("doctor", plant, "pump-7")[2]
-    assert "--rs485 is not for plant files" in run("doctor", plant, "pump-1", "--rs485", "kernel")[2]
-    assert "--rs485 is not for plant files" in run("scan", plant, "hall-1", "--rs485", "kernel")[2]
-    assert "--settle is not for plant files" in run("scan", plant, "hall-1", "--settle", "1 s")[2]
-    assert "--model is not for plant files" in run("doctor", plant, "pump-1", "--model", TOY)[2]
+    assert (
+        "--rs485 cannot be used with a plant file" in run("doctor", plant, "pump-1", "--rs485", "kernel")[2]
+    )
+    assert "--rs485 cannot be used with a plant file" in run("scan", plant, "hall-1", "--rs485", "kernel")[2]
+    assert "--settle cannot be used with a plant file" in run("scan", plant, "hall-1", "--settle", "1 s")[2]
+    assert "--model cannot be used with a plant file" in run("doctor", plant, "pump-1", "--model", TOY)[2]
 
 
 def test_the_sniff_command_accepts_a_plant_file_and_a_line(run: Run, plant: Path, at: str) -> None:

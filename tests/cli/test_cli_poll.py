@@ -131,7 +131,7 @@ def test_the_commands_convert_and_report_ask_for_one_segment_file(run: Run, tmp_
         with open_writer(tmp_path / f"run.0000000{number}.arrows", METADATA) as writer:
             writer.write(counting(100, 0))
     whole, newest = tmp_path / "run.arrows", tmp_path / "run.00000002.arrows"
-    sentence = f"multidrop: {whole} was recorded in segments: name one, such as {newest}\n"
+    sentence = f"multidrop: {whole} was recorded in several files: name one of them, such as {newest}\n"
     assert run("convert", whole, tmp_path / "a.csv") == (2, "", sentence)
     require_module("matplotlib")
     assert run("report", whole) == (2, "", sentence)
@@ -140,9 +140,15 @@ def test_the_commands_convert_and_report_ask_for_one_segment_file(run: Run, tmp_
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["--keep", "1 h"], '--keep and --most remove whole files: add --rotate, such as --rotate "1 h"'),
-        (["--rotate", "1 h"], "--rotate needs a name that ends in .arrows, such as --out run.arrows"),
-        (["--rotate", "1 h", "--out", "a.csv"], "--rotate needs a name that ends in .arrows"),
+        (
+            ["--keep", "1 h"],
+            '--keep and --most need --rotate, because they delete whole files: add --rotate "1 h"',
+        ),
+        (
+            ["--rotate", "1 h"],
+            "--rotate needs --out with a file name that ends in .arrows, such as --out run.arrows",
+        ),
+        (["--rotate", "1 h", "--out", "a.csv"], "--rotate needs --out with a file name that ends in .arrows"),
         (["--rotate", "soon"], "invalid time 'soon': write 1 s to 100 years"),
         (["--most", "big"], "invalid size 'big': write 1 kB or more"),
         (["--trigger", "pump-1.output_current", *OUT], "--trigger pump-1.output_current: column 1: "),
@@ -150,7 +156,10 @@ def test_the_commands_convert_and_report_ask_for_one_segment_file(run: Run, tmp_
         (["--trigger", "key"], "--trigger needs --out"),
         (["--trigger", "key", *OUT, "--rotate", "1 h"], "--trigger and --rotate exclude each other"),
         (["--trigger", "key", "--out", "a.txt"], "a.txt: a recording's name must end in .arrows"),
-        (["--trigger", "key", *OUT], "the trigger 'key' needs a terminal without --json"),
+        (
+            ["--trigger", "key", *OUT],
+            "--trigger key waits for a key press, so it needs a terminal and no --json",
+        ),
         (["--pre", "1 s"], "--pre and --post belong to a trigger"),
     ],
 )

@@ -167,7 +167,7 @@ def test_the_params_command_compares_two_files_and_two_drives(run: Run, drive: t
         (("diff", "--defaults", "DRIVE"), "prints no factory values"),
         (("diff", "newest.toml"), "give two sides to compare"),
         (("save", "DRIVE", "other.toml"), "other.toml exists already, and is not replaced"),
-        (("save", "DRIVE"), "give the drive, and one file to write"),
+        (("save", "DRIVE"), "give a drive, and then the name of one file for its parameters"),
         (("list", "invt-che"), "no reliable rule"),
     ],
 )
@@ -226,9 +226,9 @@ def test_contradicting_options_of_run_are_refused(run: Run, tmp_path: Path) -> N
     path = write_test(tmp_path)
     assert run("run", path, "--speed", 3)[::2] == (
         2,
-        "multidrop: --speed is for simulated drives: add --simulate\n",
+        "multidrop: --speed changes the pace of simulated time, so it needs --simulate\n",
     )
-    assert "--simulate has ports of its own" in run("run", path, "--simulate", "--port", "hall=x")[2]
+    assert "--simulate opens its own ports" in run("run", path, "--simulate", "--port", "hall=x")[2]
     status, _, errors = run("run", path)
     assert status == 1
     assert "There is no terminal to ask on: add --yes to confirm" in errors

@@ -152,7 +152,7 @@ def test_a_drive_without_line_settings_uses_those_of_its_bus() -> None:
 def test_a_drive_cannot_be_attached_to_a_closed_bus() -> None:
     with unpaced(simulated(Toy(1))) as sim, Bus(path(sim)) as bus:
         bus.close()
-        with pytest.raises(LineError, match="its bus is closed: open a new one for toy@1"):
+        with pytest.raises(LineError, match="the bus is closed: attach toy@1 to a new Bus"):
             bus.attach(Toy, 1)
 
 
@@ -213,8 +213,8 @@ MISTAKES: dict[type[Exception], list[tuple[Callable[[Bus, Any], Any], str]]] = {
             lambda bus, rig: rig.read(rig.speed, rig.target),
             "target of pump cannot be read: it is declared as a command",
         ),
-        (lambda bus, rig: bus.attach(Toy, 1), "address 1 is taken by pump"),
-        (lambda bus, rig: bus.attach(rig), "address 1 is taken by pump"),
+        (lambda bus, rig: bus.attach(Toy, 1), "address 1 is already used by pump"),
+        (lambda bus, rig: bus.attach(rig), "address 1 is already used by pump"),
         (lambda bus, rig: bus.attach(Toy, 32), "address 32 is not supported by TOY T1; choose 1 to 31"),
         (lambda bus, rig: Toy(5).read(Toy.status), "toy@5 is not attached to a bus: use bus.attach(...)"),
         (
@@ -255,11 +255,11 @@ MISTAKES: dict[type[Exception], list[tuple[Callable[[Bus, Any], Any], str]]] = {
         ),
         (
             lambda bus, rig: bus.attach(Toy(3, name="pump"), name="fan"),
-            "pump already exists: give its address and options to Toy(…)",
+            "attach takes no address or options with a drive object; write them in Toy(…)",
         ),
         (
             lambda bus, rig: bus.attach(Toy(3, name="pump"), 2),
-            "pump already exists: give its address and options to Toy(…)",
+            "attach takes no address or options with a drive object; write them in Toy(…)",
         ),
         (
             lambda bus, rig: bus.detach(cast(Any, "pump")),

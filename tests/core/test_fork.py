@@ -378,7 +378,7 @@ print("and here it works:", Bus.__name__)
 def test_an_import_fails_in_a_sub_interpreter_but_not_in_the_main_one() -> None:
     done = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, check=True)
     refused = (
-        "multidrop works in a process's main interpreter only, and this is a sub-interpreter: "
+        "multidrop cannot be imported in a sub-interpreter. Import it in the process's main "
         "use it there, or in a process of its own"
     )
     lines = done.stdout.splitlines()

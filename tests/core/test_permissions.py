@@ -132,7 +132,7 @@ def test_a_past_deadline_raises_and_arms_no_timer() -> None:
 
 @table("wrong", [1.5, "now", None, True])
 def test_a_deadline_that_is_not_a_whole_number_raises(wrong: object) -> None:
-    with pytest.raises(TypeError, match=r"^until_ns is a whole number of ns of CLOCK_BOOTTIME, not "):
+    with pytest.raises(TypeError, match=r"^until_ns must be a whole number of ns of CLOCK_BOOTTIME, not "):
         Mastership().extend(wrong)  # type: ignore[arg-type]
 
 
@@ -148,7 +148,7 @@ def test_a_guard_time_out_of_range_raises(wrong: float) -> None:
 
 
 def test_a_guard_time_that_is_not_a_number_raises() -> None:
-    with pytest.raises(TypeError, match=r"^guard_s is a number of seconds, not '1'$"):
+    with pytest.raises(TypeError, match=r"^guard_s must be a number of seconds, not '1'$"):
         Mastership("1")  # type: ignore[arg-type]
 
 

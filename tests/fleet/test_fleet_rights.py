@@ -194,8 +194,8 @@ async def _ignore(_: Exception) -> None:
     ("names", "sentence"),
     [
         (["gw.1"], "the gateway's name 'gw.1' may have only letters"),
-        (["gw-1", "gw-1"], "'gw-1' is taken"),
-        (["hub"], "'hub' is taken"),
+        (["gw-1", "gw-1"], "the gateway name 'gw-1' is used twice or reserved"),
+        (["hub"], "the gateway name 'hub' is used twice or reserved"),
     ],
 )
 def test_invalid_names_of_gateways_are_rejected(names: list[str], sentence: str) -> None:
@@ -230,7 +230,9 @@ def test_adding_a_gateway_keeps_all_existing_keys(tmp_path: Path) -> None:
     assert public_key(text("keys/gw-1.key").strip()) not in text("rights.conf")
     (tmp_path / "keys/hub.key").write_text("SUNKEN")
     before = {str(path): path.read_text() for path in tmp_path.rglob("*") if path.is_file()}
-    with pytest.raises(ValueError, match=r"hub\.key is damaged: remove it, then its user gets a new key"):
+    with pytest.raises(
+        ValueError, match=r"hub\.key is damaged: delete it and run the command again, which writes a new key"
+    ):
         write_files(tmp_path, ["gw-3"], urls, None)
     assert {str(path): path.read_text() for path in tmp_path.rglob("*") if path.is_file()} == before
 
@@ -281,9 +283,12 @@ def test_rights_without_tls_cause_a_warning(run: Run, tmp_path: Path) -> None:
     [
         ([], "are required: NAMES; see `multidrop fleet rights --help`"),
         (["gw-1,gw.2"], "the gateway's name 'gw.2' may have only letters"),
-        (["gw-1,operator"], "'operator' is taken"),
-        (["gw-1", "--ca", "ca.pem"], "TLS needs all of --ca, --cert and --key: paths on the servers"),
-        (["gw-1", "--nats", "tls://a:4222"], "tls://a:4222 needs all of --ca, --cert and --key"),
+        (["gw-1,operator"], "the gateway name 'operator' is used twice or reserved"),
+        (
+            ["gw-1", "--ca", "ca.pem"],
+            "TLS needs --ca, --cert and --key. Give each as the file's path on the NATS servers",
+        ),
+        (["gw-1", "--nats", "tls://a:4222"], "tls://a:4222 needs --ca, --cert and --key"),
         (["gw-1", "--nats", "nats://a:64000"], "nats://a:64000 is not an address of a NATS server"),
         (["gw-1", "--nats", "nats://a:port"], "nats://a:port is not an address of a NATS server"),
     ],

@@ -255,7 +255,7 @@ async def test_watch_ends_when_the_task_of_its_connection_ends(monkeypatch: pyte
 def test_the_watch_command_suggests_json_without_a_terminal(run: Run) -> None:
     status, out, err = run("fleet", "watch")
     assert (status, out) == (2, "")
-    assert "`multidrop fleet watch` needs a terminal; with --json it works without one" in err
+    assert "`multidrop fleet watch` needs a terminal. Without a terminal, add --json" in err
 
 
 @pytest.mark.long

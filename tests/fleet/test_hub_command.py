@@ -181,7 +181,7 @@ def test_the_hub_refuses_a_folder_of_another_program_in_one_sentence(
     (tmp_path / "report.txt").write_text("mine")
     assert refused(capsys, running.urls[0], "--parquet", str(tmp_path)) == (
         1,
-        f"multidrop: {tmp_path} is not a hub's folder: it holds 'report.txt'; name an empty folder\n",
+        f"multidrop: {tmp_path} holds 'report.txt', not written by `multidrop hub`: name an empty folder\n",
     )
 
 

@@ -239,11 +239,11 @@ def test_a_newly_made_token_is_shown_once(run: Run) -> None:
     ("words", "sentence"),
     [
         ((), "name a plant file, or try `multidrop serve --demo`"),
-        (("--demo", "plant.toml"), "--demo has its own plant: remove the plant file"),
-        (("--demo", "--port", "hall=x"), "--demo has its own plant: remove --port"),
+        (("--demo", "plant.toml"), "--demo uses its own plant: give no plant file"),
+        (("--demo", "--port", "hall=x"), "--demo uses its own plant: remove --port"),
         (
             ("--new-token", "stop"),
-            "a new token needs a role and an owner: multidrop serve --new-token stop --for anna",
+            "a new token needs a role and an owner, such as `multidrop serve --new-token stop --for anna`",
         ),
         (
             ("--new-token", "stop", "--for", "a b"),

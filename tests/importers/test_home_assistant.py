@@ -244,7 +244,7 @@ def test_home_assistant_hubs_with_the_same_name_can_be_selected(run: Run, tmp_pa
     )
     status, _, err = run("import", source)
     assert status == 2
-    assert "devices at 1 of 'hub', 1 of 'hub 2', an unknown address of 'hub 3'" in err
+    assert "devices, at 1 of 'hub', 1 of 'hub 2', an unknown address of 'hub 3'" in err
     for title, name in (("hub", "amp"), ("hub 2", "volt"), ("hub 3", "watt")):
         status, out, _ = run("import", source, "--title", title)
         assert (status, f"{name} = " in out) == (0, True)

@@ -430,8 +430,8 @@ def test_devices_with_the_same_address_on_two_hubs_stay_separate(run: Run, tmp_p
     source.write_text(HUBS)
     status, _, err = run("import", source, "--address", "1")
     assert status == 2
-    assert "devices at 1 of 'north', 1 of 'south'" in err
-    assert "choose one, such as --address 1 --title 'north'" in err
+    assert "devices, at 1 of 'north', 1 of 'south'" in err
+    assert "Choose one with an option, such as --address 1 --title 'north'" in err
     status, out, _ = run("import", source, "--address", "1", "--title", "south")
     assert (status, "amp = " in out) == (0, True)
 
@@ -459,7 +459,10 @@ def test_the_import_command_asks_which_of_several_devices_to_import(run: Run, tm
     source = tmp_path / "telegraf.conf"
     source.write_text(TELEGRAF)
     status, _, err = run("import", source)
-    assert (status, "the file has devices at 3, 4: choose one, such as --address 3" in err) == (2, True)
+    assert (
+        status,
+        "the file has several devices, at 3, 4. Choose one with an option, such as --address 3" in err,
+    ) == (2, True)
     status, out, _ = run("import", source, "--address", "4")
     assert status == 0
     assert "volt = { at = 0x0000" in out

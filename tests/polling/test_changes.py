@@ -115,7 +115,7 @@ def test_the_removal_of_a_silent_drive_does_not_disturb_other_drives(port: str) 
 def test_invalid_additions_and_removals_are_errors(port: str) -> None:
     with Poller(plant(line(port, pump(1)))) as poller:
         for polled_drive, sentence in (
-            (pump(1, "other"), "address 1 is taken by pump-1"),
+            (pump(1, "other"), "address 1 is already used by pump-1"),
             (pump(2, "pump-1"), "two drives are called pump-1; give each its own name"),
             (polled(InvtCHE(3), [CURRENT]), "this output_current is not a register of invt-che@3"),
         ):

@@ -306,14 +306,12 @@ class Capture:
         resolution = (options.get(IF_RESOLUTION) or b"\x06")[0]
         power = resolution & ~_BINARY
         if power > (_MOST_BITS if resolution & _BINARY else _MOST_DIGITS):
-            raise CaptureError(
-                f"{self.path}: byte {at}: its time stamps are finer than a nanosecond, and cannot be read"
-            )
+            raise CaptureError(f"{self.path}: byte {at}: time stamps finer than a nanosecond cannot be read")
         ticks_per_s = 2**power if resolution & _BINARY else 10**power
         offset = options.get(_IF_OFFSET, bytes(8))
         seconds: int = struct.unpack(f"{self._order}q", offset)[0] if len(offset) == 8 else 0
         if abs(seconds) > _MOST_OFFSET:
-            raise CaptureError(f"{self.path}: byte {at}: its time offset of {seconds} s is too large")
+            raise CaptureError(f"{self.path}: byte {at}: the time offset of {seconds} s is too large")
         name = options.get(IF_NAME, b"").rstrip(b"\0").decode(errors="replace")
         link: int = struct.unpack_from(f"{self._order}H", body)[0]
         self._add(link, name or f"{self.path.stem}-{len(self.lines)}", ticks_per_s, seconds * 10**9)

@@ -304,4 +304,6 @@ def _chosen(devices: list[ImportedDevice], address: int | None, title: str | Non
         named = (f"{place} of {one.title!r}" for place, one in zip(places, devices, strict=True))
         known = ", ".join(printable(text[:100]) for text in named)
         example = f"{example} --title {printable(first.title[:60])!r}".strip()
-    raise ValueError(f"the file has devices at {known}: choose one, such as {example}")
+    raise ValueError(
+        f"the file has several devices, at {known}. Choose one with an option, such as {example}"
+    )

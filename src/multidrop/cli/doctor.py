@@ -128,7 +128,7 @@ def _of_plant(plant: Plant, arguments: argparse.Namespace) -> Iterator[_Target]:
     """
     for name in ("model", "address", "baudrate", "format", "framing"):
         if getattr(arguments, name) is not None:
-            raise ValueError(f"--{name} is not for plant files: set it in {plant.path}")
+            raise ValueError(f"--{name} cannot be used with a plant file. Write key {name!r} in {plant.path}")
     for line in plant.lines:
         opening = opening_of(arguments, line)
         if arguments.name in (None, line.name):
@@ -184,7 +184,7 @@ def _add_wake_findings(found: list[tuple[_Target, list[Finding]]]) -> None:
 
 def _drive(arguments: argparse.Namespace) -> Drive | None:
     if (arguments.model is None) != (arguments.address is None):
-        raise ValueError("--model and --address belong together: give both for the drive to measure with")
+        raise ValueError("--model and --address belong together: give both, or neither")
     if arguments.model is None:
         if arguments.framing is not None:
             raise ValueError("--framing needs a drive: add --model and --address")

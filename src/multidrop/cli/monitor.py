@@ -68,7 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     if not keys_are_readable():
         raise ValueError(
-            "`multidrop monitor` needs a terminal on Linux or macOS; `multidrop poll` works without one"
+            "`multidrop monitor` needs a terminal on Linux or macOS; `multidrop poll` needs none"
         )
     if arguments.out and not arguments.trigger:
         refuse_overwriting(arguments.out)

@@ -85,7 +85,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _save(arguments: argparse.Namespace) -> int:
     target, words = _drive_of(arguments, arguments.words)
     if len(words) != 1:
-        raise mistaken(arguments, "give the drive, and one file to write")
+        raise mistaken(arguments, "give a drive, and then the name of one file for its parameters")
     files.check_name(Path(words[0]))
     found = _read(target)
     params.save(found, words[0], type(target.drive))

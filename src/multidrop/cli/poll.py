@@ -104,7 +104,8 @@ def run(arguments: argparse.Namespace) -> int:
     plant, triggering = triggering_of(plant, arguments)
     if "key" in arguments.trigger and (arguments.json or not keys_are_readable()):
         raise ValueError(
-            "the trigger 'key' needs a terminal without --json; give a condition instead, such as fault"
+            "--trigger key waits for a key press, so it needs a terminal and no --json. "
+            "Otherwise give a condition, such as --trigger fault"
         )
     return conclude(plant, follow(plant, arguments, triggering or rotation), arguments)
 
@@ -539,8 +540,12 @@ def rotation_of(arguments: argparse.Namespace) -> Rotation | None:
     """Return how the recording is split into files. Raises ValueError for contradicting options."""
     if arguments.rotate is None:
         if arguments.keep is not None or arguments.most is not None:
-            raise ValueError('--keep and --most remove whole files: add --rotate, such as --rotate "1 h"')
+            raise ValueError(
+                '--keep and --most need --rotate, because they delete whole files: add --rotate "1 h"'
+            )
         return None
     if not arguments.out or arguments.out.suffix != ".arrows":
-        raise ValueError("--rotate needs a name that ends in .arrows, such as --out run.arrows")
+        raise ValueError(
+            "--rotate needs --out with a file name that ends in .arrows, such as --out run.arrows"
+        )
     return Rotation(arguments.rotate, arguments.keep, arguments.most)

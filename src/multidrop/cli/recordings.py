@@ -119,7 +119,7 @@ def _check_no_segments(path: Path) -> None:
             "Python with `multidrop.History`"
         )
     if not path.exists() and path.parent.is_dir() and (segments := segments_of(path)):
-        raise ValueError(f"{path} was recorded in segments: name one, such as {segments[-1][1]}")
+        raise ValueError(f"{path} was recorded in several files: name one of them, such as {segments[-1][1]}")
 
 
 def _is_folder(path: Path) -> ValueError:

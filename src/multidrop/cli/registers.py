@@ -54,7 +54,9 @@ def _run_read(arguments: argparse.Namespace) -> int:
     wanted = [drive.register(name) for name in names if name not in drive.texts]
     for register in wanted:
         if not register.readable:
-            raise ValueError(f"{register.name} can only be written; see `multidrop models {target.model}`")
+            raise ValueError(
+                f"register {register.name} cannot be read; see `multidrop models {target.model}`"
+            )
     if not names:
         texts = list(drive.texts.values())
         wanted = [register for register in drive.registers.values() if register.readable]
@@ -143,7 +145,9 @@ WEAR_HEAD = ("PORT", "ADDRESS", "MODEL", "REGISTER", "WRITES", "THIS YEAR", "LEF
 
 def _run_wear(arguments: argparse.Namespace) -> int:
     if arguments.ledger and not Path(arguments.ledger).is_file():
-        raise ValueError(f"there is no ledger {arguments.ledger}; the default is {default_ledger_path()}")
+        raise ValueError(
+            f"there is no EEPROM ledger {arguments.ledger}; the default file is {default_ledger_path()}"
+        )
     ledger = Ledger(arguments.ledger)
     found = ledger.wear((now_ns() + utc_minus_monotonic_ns()) / 1e9)
     if arguments.json:

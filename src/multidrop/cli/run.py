@@ -54,9 +54,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     if arguments.speed != 1.0 and not arguments.simulate:
-        raise ValueError("--speed is for simulated drives: add --simulate")
+        raise ValueError("--speed changes the pace of simulated time, so it needs --simulate")
     if arguments.simulate and arguments.ports:
-        raise ValueError("--simulate has ports of its own: remove --port")
+        raise ValueError("--simulate opens its own ports: remove --port")
     if arguments.out:
         refuse_overwriting(arguments.out)
     test = TestRun(arguments.test, audit=arguments.audit, speed=arguments.speed)

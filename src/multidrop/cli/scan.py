@@ -225,7 +225,7 @@ def _families(models: Sequence[str]) -> dict[str, type[Drive]]:
         named[whole] = find_model(text)
     models = [family.model for family in named.values() if family.model]
     if twice := sorted({model for model in models if models.count(model) > 1}):
-        raise ValueError(f"two files declare the model {twice[0]}: rename one, or scan for one at a time")
+        raise ValueError(f"two family files declare the model {twice[0]}: name only one of them in a scan")
     return named
 
 
@@ -238,8 +238,8 @@ def _planned(arguments: argparse.Namespace, families: Sequence[type[Drive]]) -> 
     fixed = arguments.port.startswith("socket://")
     if fixed and len(arguments.baudrates) != 1:
         raise ValueError(
-            f"the serial server at {arguments.port} sets the baud rate itself: "
-            "name this rate, such as --baudrates 9600"
+            f"the serial server at {arguments.port} sets the baud rate itself. "
+            "Give the server's rate, such as --baudrates 9600"
         )
     planned = sweeps(
         families, addresses=arguments.addresses, baudrates=arguments.baudrates, formats=arguments.formats

@@ -63,9 +63,9 @@ def run(arguments: argparse.Namespace) -> int:
         return _new_token(arguments.new_token, arguments.owner)
     if arguments.demo:
         if arguments.plant:
-            raise ValueError("--demo has its own plant: remove the plant file")
+            raise ValueError("--demo uses its own plant: give no plant file")
         if arguments.ports:
-            raise ValueError("--demo has its own plant: remove --port")
+            raise ValueError("--demo uses its own plant: remove --port")
         return serve_demo(is_shown=not arguments.no_browser, log=arguments.log)
     if not arguments.plant:
         raise ValueError("name a plant file, or try `multidrop serve --demo`")
@@ -224,7 +224,9 @@ def _new_token(role: str | None, owner: str | None) -> int:
     from multidrop.gateway.http.rights import Right, new_token
 
     if not role or not owner:
-        raise ValueError("a new token needs a role and an owner: multidrop serve --new-token stop --for anna")
+        raise ValueError(
+            "a new token needs a role and an owner, such as `multidrop serve --new-token stop --for anna`"
+        )
     secret, token = new_token(owner, Right[role.upper()])
     print_text(token.line)
     warn(f"the token of {owner}, shown this once: {secret}")

@@ -90,7 +90,9 @@ def _port(line: PlantLine, directory: Path | None) -> str:
         return line.port
     link = directory / line.name
     if link.parent != directory:
-        raise ValueError(f"line {line.name!r} has a / in its name: rename it to link its port")
+        raise ValueError(
+            f"--ports cannot name a file after line {line.name!r}: rename the line to a name without /"
+        )
     if (link.is_symlink() or link.exists()) and not is_dead_link(link):
         raise ValueError(f"{link} exists already: remove it, or choose another directory with --ports")
     return str(link)

@@ -96,7 +96,7 @@ class Mastership:
 
     def __init__(self, guard_s: float = GUARD_S) -> None:
         if isinstance(guard_s, bool) or not isinstance(guard_s, (int, float)):
-            raise TypeError(f"guard_s is a number of seconds, not {guard_s!r}")
+            raise TypeError(f"guard_s must be a number of seconds, not {guard_s!r}")
         if not 0 < guard_s <= MOST_GUARD_S:
             raise ValueError(f"guard_s = {guard_s!r} must be above 0 and at most {MOST_GUARD_S:g}, in s")
         self.guard_s = float(guard_s)
@@ -143,7 +143,7 @@ class Mastership:
         once.
         """
         if isinstance(until_ns, bool) or not isinstance(until_ns, int):
-            raise TypeError(f"until_ns is a whole number of ns of CLOCK_BOOTTIME, not {until_ns!r}")
+            raise TypeError(f"until_ns must be a whole number of ns of CLOCK_BOOTTIME, not {until_ns!r}")
         if self._is_inherited:
             raise ValueError("this mastership belongs to the parent of this forked process: create a new one")
         late_ns = boottime_ns() - until_ns

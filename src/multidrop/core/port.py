@@ -339,7 +339,7 @@ def get_settings(fd: int) -> tuple[int, str]:
     settings = ffi.new("struct md_settings *")
     failure = lib.md_port_get(fd, settings)
     if failure:
-        raise OSError(-failure, "no serial settings")
+        raise OSError(-failure, "the port has no serial settings")
     return settings.baudrate, f"{settings.databits}{settings.parity.decode()}{settings.stopbits}"
 
 
@@ -350,7 +350,7 @@ def set_settings(fd: int, baudrate: int, format: str) -> int:
     """
     refused = lib.md_port_set(fd, ffi.new("struct md_settings *", settings_to_c(baudrate, format)))
     if refused < 0:
-        raise OSError(-refused, "no serial settings")
+        raise OSError(-refused, "the port has no serial settings")
     return int(refused)
 
 

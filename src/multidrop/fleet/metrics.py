@@ -69,8 +69,8 @@ def local_address(text: str) -> tuple[str, int]:
     host, port = parse_address(text, f"--metrics {EXAMPLE}")
     if not _is_loopback(host):
         raise ValueError(
-            f"--metrics {text} is open to other machines, without tokens or TLS: listen "
-            f"on {EXAMPLE}, and put a proxy with TLS in front"
+            f"--metrics {text} is open to other machines, without tokens or TLS. "
+            f"Write --metrics {EXAMPLE}, and let a proxy with TLS forward to it"
         )
     return host, port
 

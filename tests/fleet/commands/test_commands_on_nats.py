@@ -291,9 +291,12 @@ def test_the_fleet_command_line_can_write_a_setpoint_and_stop_a_drive(drill: Com
     assert "asked" in (drill.folder / "state/multidrop/fleet/commands.jsonl").read_text()
     for words, sentence in (
         (("write", "drive-0", "frequency", "10"), "There is no terminal to ask on: add --yes"),
-        (("start", "drive-0", "--yes"), "drive-0.start is not in the plant's list"),
-        (("emergency-stop", "drive-0"), "drive-0.emergency_stop is not in the plant's list"),
-        (("write", "drive-0", "acceleration_time", "10", "--yes"), "is not in the plant's list"),
+        (("start", "drive-0", "--yes"), "the plant file does not allow drive-0.start for the fleet"),
+        (("emergency-stop", "drive-0"), "the plant file does not allow drive-0.emergency_stop for the fleet"),
+        (
+            ("write", "drive-0", "acceleration_time", "10", "--yes"),
+            "the plant file does not allow drive-0.acceleration_time",
+        ),
         (("write", "drive-0", "frequency", "-1", "--yes"), "frequency"),
         (("write", "drive-9", "frequency", "1", "--yes"), "has no drive 'drive-9'"),
         (("stop", "drive-9"), "has no drive 'drive-9'"),

@@ -247,7 +247,7 @@ async def test_the_hub_refuses_a_stream_that_has_lost_its_newest_messages(runnin
         sink.commits.append(Commit("", 1, 5, {}, [], 0))
         with pytest.raises(
             NotThisHubs,
-            match="the stream ends at message 1, but 5 are already stored: the stream has lost messages",
+            match="the stream ends at message 1, but the hub has stored message 5",
         ):
             await SampleHub(path, sink).run()
 
@@ -344,7 +344,7 @@ def test_the_hub_refuses_a_folder_of_another_stream_or_program(tmp_path: Path) -
         ParquetSink(tmp_path)
     sink.close()
     (tmp_path / "rows.00000001.arrows").write_bytes(b"")
-    with pytest.raises(NotThisHubs, match=r"is not a hub's folder: it holds 'rows.00000001.arrows'"):
+    with pytest.raises(NotThisHubs, match=r"holds 'rows.00000001.arrows', not written by `multidrop hub`"):
         ParquetSink(tmp_path)
 
 

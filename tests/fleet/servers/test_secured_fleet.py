@@ -167,8 +167,12 @@ def unknown_key(servers: SecuredCluster, folder: Path) -> list[str]:
 MISTAKES: dict[str, tuple[Callable[[SecuredCluster, Path], list[str]], int, str]] = {
     "another authority": (other_ca, 1, "is not trusted (unable to get local issuer certificate)"),
     "no such key": (no_key, 2, "none.key: No such file or directory"),
-    "a damaged key": (damaged_key, 2, "hub.key is not a valid key of `fleet rights`"),
-    "something else": (strange_key, 2, "hub.key has no credentials: name a key of `fleet rights`"),
+    "a damaged key": (damaged_key, 2, "hub.key is not a valid key file of `multidrop fleet rights`"),
+    "something else": (
+        strange_key,
+        2,
+        "hub.key has no credentials: name a key file of `multidrop fleet rights`",
+    ),
     "no certificate": (strange_ca, 2, "ca.pem has no certificate: it must be a PEM file"),
     "an unknown key": (unknown_key, 1, "refuses these credentials, or the lack of any"),
 }

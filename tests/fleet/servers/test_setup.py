@@ -387,7 +387,7 @@ def test_a_gateway_does_not_run_a_python_file_from_a_line_record(tmp_path: Path,
     drive = {"name": "pump", "model": model, "address": 1}
     line = {"name": "hall", "port": "tcp://127.0.0.1:502", "drive": [drive]}
     files = {"own.py": f"open({str(ran)!r}, 'w')\n"}
-    with pytest.raises(ValueError, match="gateways run no code from the network"):
+    with pytest.raises(ValueError, match="which gateways of a fleet do not run"):
         line_of(Record("hall", 1, {"line": line, "files": files}), tmp_path / "gateway")
     assert not ran.exists()
 

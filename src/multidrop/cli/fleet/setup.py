@@ -85,7 +85,9 @@ def _tls(arguments: argparse.Namespace, urls: Sequence[str]) -> TlsFiles | None:
     if secure is None:
         return None
     if not all(files):
-        raise ValueError(f"{secure} needs all of --ca, --cert and --key: paths on the servers")
+        raise ValueError(
+            f"{secure} needs --ca, --cert and --key. Give each as the file's path on the NATS servers"
+        )
     return TlsFiles(*files)
 
 

@@ -47,7 +47,7 @@ async def watch(arguments: argparse.Namespace, paths: list[ServerPath]) -> int:
     from multidrop.fleet.overview import FleetView, FleetWatch
 
     if not arguments.json and not sys.stdout.isatty():
-        raise ValueError("`multidrop fleet watch` needs a terminal; with --json it works without one")
+        raise ValueError("`multidrop fleet watch` needs a terminal. Without a terminal, add --json")
     path = await open_path(paths)
     view = FleetView(path)
     await view.check()

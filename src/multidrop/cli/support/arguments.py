@@ -169,7 +169,7 @@ def opening_of(arguments: argparse.Namespace, line: PlantLine | None) -> tuple[R
         return rs485, 0.0 if arguments.settle is None else parse_duration(arguments.settle)
     for name in ("rs485", "settle"):
         if getattr(arguments, name) is not None:
-            raise ValueError(f"--{name} is not for plant files: set {name} in the line's table there")
+            raise ValueError(f"--{name} cannot be used with a plant file. Write key {name!r} in that file")
     return line.rs485, line.settle
 
 
@@ -184,7 +184,9 @@ def plant_at(arguments: argparse.Namespace) -> Plant | None:
         return plant_of(arguments.port, arguments)
     check_port(arguments.port)
     if arguments.ports:
-        raise ValueError("--port is for a plant file; without a plant file, the first argument is the port")
+        raise ValueError(
+            "--port needs a plant file. Without a plant file, give the port as the first argument"
+        )
     if arguments.name is not None:
         raise mistaken(arguments, f"unrecognized arguments: {arguments.name}")
     return None
@@ -288,7 +290,9 @@ def target_of(arguments: argparse.Namespace) -> tuple[Target, list[str]]:
         return _by_plant(arguments), words[len(_BY_PLANT) :]
     check_words(arguments, words[: len(_BY_PORT)], _BY_PORT)
     if arguments.ports:
-        raise ValueError("--port is for a plant file; without a plant file, the first argument is the port")
+        raise ValueError(
+            "--port needs a plant file. Without a plant file, give the port as the first argument"
+        )
     return _by_port(arguments), words[len(_BY_PORT) :]
 
 
@@ -314,7 +318,7 @@ def _by_plant(arguments: argparse.Namespace) -> Target:
         f"--{name}" for name in (*_SETTINGS, "option", "ram") if getattr(arguments, name) not in (None, [])
     ]
     if given:
-        raise ValueError(f"{given[0]} is not for plant files: set it in {path}")
+        raise ValueError(f"{given[0]} cannot be used with a plant file. Write the setting in {path}")
     drives = [polled.drive.name for polled in plant.drives]
     if not names:
         raise mistaken(arguments, f"choose a drive of {path}: {', '.join(drives)}")

@@ -194,7 +194,7 @@ def simulator(
             for name in names:
                 ready = f"ready {name} "
                 if not (printed := process.stdout.readline().rstrip("\n")).startswith(ready):
-                    raise OSError("the simulator did not start; its reason is above")
+                    raise OSError("the simulator did not start; the lines above give the reason")
                 found[name] = printed.removeprefix(ready)
             yield found
         finally:

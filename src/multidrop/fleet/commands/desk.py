@@ -205,8 +205,8 @@ def _prepared(held: HeldLine, request: CommandRequest) -> Prepared:
     kind = "write" if request.register else "verbs"
     if request.entry not in held.may[kind]:
         raise ValueError(
-            f'{request.entry} is not in the plant\'s list; add it to {kind} = ["{request.entry}"] of '
-            "[fleet.may], and run `multidrop fleet init` again"
+            f'the plant file does not allow {request.entry} for the fleet. Add {kind} = ["{request.entry}"] '
+            "to its table [fleet.may], and run `multidrop fleet init` again"
         )
     return prepare(drive, request)
 

@@ -48,7 +48,7 @@ class CommandLog:
         record is then written as soon as the disk answers.
         """
         if self._waiting >= MOST_WAITING:
-            raise OSError(f"{self.path}: {MOST_WAITING} records wait for the disk")
+            raise OSError(f"{self.path}: {MOST_WAITING} records are already waiting; does the disk answer?")
         self._waiting += 1
         work = self._write(record, time.time_ns(), self._latest)
         self._latest = writing = supervisor().start("command log", work)

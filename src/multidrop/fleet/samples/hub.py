@@ -240,8 +240,8 @@ class SampleHub:
     def _check_end(self, found: StreamInfo) -> None:
         if found.last < self._place:
             raise NotThisHubs(
-                f"the stream ends at message {found.last}, but {self._place} are already stored: the stream "
-                f"has lost messages; use a new folder or database"
+                f"the stream ends at message {found.last}, but the hub has stored message {self._place}. "
+                "The stream has lost messages: use a new folder or database"
             )
 
     async def _commit(self, once: bool) -> bool:
@@ -328,7 +328,7 @@ class ParquetSink:
         if others:
             self.close()
             raise NotThisHubs(
-                f"{self.folder} is not a hub's folder: it holds {others[0]!r}; name an empty folder"
+                f"{self.folder} holds {others[0]!r}, not written by `multidrop hub`: name an empty folder"
             )
 
     def close(self) -> None:
@@ -347,7 +347,7 @@ class ParquetSink:
         last, path = newest
         found = _metadata(path).get("hub")
         if not isinstance(found, dict) or not isinstance(found.get("sources"), dict):
-            raise NotThisHubs(f"{path} was not written by a hub: name an empty folder")
+            raise NotThisHubs(f"{path} was not written by `multidrop hub`: name an empty folder")
         if found.get("stream") != stream:
             raise NotThisHubs(
                 f"{self.folder} holds samples of a stream created at {found.get('stream')}, but the present "

@@ -152,7 +152,9 @@ async def stream_info(path: ServerPath) -> StreamInfo:
     with _checked_fields():
         config, state = found["config"], found["state"]
         if not config.get("allow_direct"):
-            raise FleetError(f"the stream {STREAM!r} allows no direct gets: set allow_direct")
+            raise FleetError(
+                f"the stream {STREAM!r} allows no direct gets: set allow_direct of the stream to true in NATS"
+            )
         return StreamInfo(str(found["created"]), int(state["first_seq"]), int(state["last_seq"]))
 
 

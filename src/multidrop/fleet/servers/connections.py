@@ -223,7 +223,7 @@ class ServerPath:
         try:
             return await client.request(subject, data, answer_s, headers=headers)
         except nats.errors.NoRespondersError:
-            raise NobodyThere(f"no one answers {subject} at {self.url}") from None
+            raise NobodyThere(f"{self.url} has no subscriber that answers {subject}") from None
         except (NatsError, OSError, TimeoutError) as failure:
             denials.check_request(subject, self._options.get("inbox_prefix", "_INBOX"), before)
             raise OutcomeUnknown(f"{self.url} gave no answer to {subject}: {failure}") from None
@@ -465,11 +465,13 @@ def _user(credentials: Path) -> dict[str, Any]:
     if CREDS in text:
         return {"user_credentials": str(credentials)}
     if not text.startswith(SEED):
-        raise ValueError(f"{credentials} has no credentials: name a key of `fleet rights`, or a .creds file")
+        raise ValueError(
+            f"{credentials} has no credentials: name a key file of `multidrop fleet rights`, or a .creds file"
+        )
     try:
         public = public_key(text)
     except ValueError:
-        raise ValueError(f"{credentials} is not a valid key of `fleet rights`") from None
+        raise ValueError(f"{credentials} is not a valid key file of `multidrop fleet rights`") from None
     return {"nkeys_seed_str": text, "inbox_prefix": inbox_of(public)}
 
 

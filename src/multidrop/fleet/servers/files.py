@@ -139,7 +139,9 @@ def _public(path: Path, seed: str) -> str:
     try:
         return public_key(seed)
     except ValueError:
-        raise ValueError(f"{path} is damaged: remove it, then its user gets a new key") from None
+        raise ValueError(
+            f"{path} is damaged: delete it and run the command again, which writes a new key"
+        ) from None
 
 
 def _write_secret(path: Path, text: str) -> None:
@@ -251,7 +253,8 @@ def rights_of(gateways: Sequence[str]) -> dict[str, UserRights]:
         names.checked_name("gateway", name)
         if name in OTHERS or gateways.count(name) > 1:
             raise ValueError(
-                f"{name!r} is taken: each gateway needs its own name, other than {', '.join(OTHERS)}"
+                f"the gateway name {name!r} is used twice or reserved: write another name "
+                f"(reserved: {', '.join(OTHERS)})"
             )
     return {**{name: _gateway(name) for name in gateways}, **OTHERS}
 

@@ -41,8 +41,8 @@ def read_plant(path: Path) -> tuple[Plant, dict[str, Any]]:
             raise ValueError(f"{path}: {mistake}") from None
         if not line.port.startswith(SOCKETS):
             raise ValueError(
-                f"{path}: line {line.name} is at {line.port}: a fleet polls socket:// and tcp:// ports, "
-                "which every gateway can reach, and can close without a delay"
+                f"{path}: line {line.name} has the port {line.port}. A fleet needs a socket:// or tcp:// "
+                "port, which every gateway can reach"
             )
         try:
             check_channels(replace(plant, lines=(line,)))
@@ -90,8 +90,8 @@ def _models(line: Mapping[str, Any]) -> set[str]:
     for model in models:
         if ".py" in model:
             raise ValueError(
-                f"line {line.get('name')}: the family {model} is a Python file, and gateways run no code "
-                "from the network; declare it in TOML"
+                f"line {line.get('name')}: the family {model} is a Python file, which gateways of a fleet "
+                "do not run. Declare the family in a TOML file"
             )
     return models
 
@@ -105,7 +105,7 @@ def _family_files(folder: Path, model: str) -> dict[str, str]:
         if other.name in text:
             found[str(Path(model).parent / other.name)] = other.read_text("utf-8")
     if any(Path(name).is_absolute() or ".." in Path(name).parts for name in found):
-        raise ValueError(f"the family {model} must be in the plant file's folder, or below it")
+        raise ValueError(f"the family file {model} must be in the plant file's folder, or below it")
     return found
 
 

@@ -39,8 +39,8 @@ async def set_up(paths: Sequence[ServerPath]) -> dict[str, Any]:
     away = [path.urls[0] for path in paths if path.url != path.urls[0]]
     if away and not replicas:
         raise FleetError(
-            f"{away[0]} does not answer, and new buckets would always stay on the other servers: start this "
-            f"server first, or leave its address out"
+            f"the NATS server {away[0]} does not answer, and would later hold no buckets. "
+            "Start this server, or leave out its address"
         )
     replicas = replicas or reached
     await _contest(paths, reached)
@@ -171,8 +171,8 @@ async def _contest(paths: Sequence[ServerPath], replicas: int) -> None:
             if len(granted) > 1:
                 raise FleetError(
                     f"{paths[0].url} and the other NATS servers accepted {len(granted)} of {CLAIMANTS} "
-                    "concurrent writes to the same revision of a record: they could give one lease to two "
-                    "gateways"
+                    "concurrent writes to the same revision of a record. "
+                    "Such servers could give one lease to two gateways"
                 )
             if granted:
                 revision = granted[0]
