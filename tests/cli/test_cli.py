@@ -135,8 +135,8 @@ def test_the_help_imports_no_command_and_no_large_library() -> None:
         ),
         (
             ["read", "sockt://10.0.0.7:4001", TOY, "1"],
-            "sockt://10.0.0.7:4001: there is no sockt://; a URL is such as tcp://10.0.0.7, "
-            "socket://10.0.0.7:4001 or rfc2217://10.0.0.7:4001",
+            "sockt://10.0.0.7:4001: the scheme sockt:// is not supported; write a URL such as "
+            "tcp://10.0.0.7, socket://10.0.0.7:4001 or rfc2217://10.0.0.7:4001",
         ),
         (["jog", "/dev/ttyX", TOY, "1"], "toy@1: the document of TOY T1 has no jog command"),
         (["set-frequency", "/dev/ttyX", TOY, "1", "nan"], "frequency takes a finite number, not nan"),
@@ -263,10 +263,13 @@ def test_forbidden_writes_print_a_sentence_and_return_1(run: Run, words: list[st
 @pytest.mark.parametrize(
     ("words", "advice"),
     [
-        (["set-frequency", "/dev/ttyX", "invt-che", "1", "20"], "P0.04: add --option maximum_frequency=HZ"),
+        (
+            ["set-frequency", "/dev/ttyX", "invt-che", "1", "20"],
+            "frequency: add --option maximum_frequency=HZ",
+        ),
         (
             ["start", "/dev/ttyX", "innovert-ibd", "1", "--direction", "forward"],
-            "which of bits 2 and 3 turns it forward, and add --option forward_bit=N",
+            "which of them turns the motor forward and add --option forward_bit=N",
         ),
         (
             ["write", "/dev/ttyX", "yd1000", "1", "control", "run"],
@@ -288,7 +291,7 @@ def test_advice_for_a_drive_in_a_plant_refers_to_the_plant_file(run: Run, tmp_pa
     )
     status, out, err = run("set-frequency", plant, "fan", "20")
     assert (status, out) == (1, "")
-    assert "P0.04: write maximum_frequency = HZ below its [[line.drive]]" in err
+    assert "maximum frequency: write maximum_frequency = HZ below its [[line.drive]]" in err
 
 
 def test_the_advice_for_programs_is_converted_for_the_command_line() -> None:
@@ -311,7 +314,7 @@ def test_each_kind_of_advice_in_errors_has_a_command_that_replaces_it() -> None:
     for script, command in (
         (erman.start.script(), "then run `multidrop reset-fault` and add --option acknowledged_fault=64"),
         (che.start.script(), "remove its cause, then run `multidrop reset-fault`"),
-        (ibd.identify.script(), "and add --option confirmed=1 if it is an IBD"),
+        (ibd.identify.script(), "and add --option confirmed=1 if the drive is an IBD"),
     ):
         with pytest.raises(WriteForbidden) as refused:
             carry_out(script, lambda step: step.register.decode(answers.get(step.register.name, 0)))

@@ -440,5 +440,5 @@ def test_undocumented_port_urls_are_refused_before_they_are_opened(
     (tmp_path / "precious").write_text("precious")
     port = f"spy:///dev/null?file={tmp_path}/precious"
     assert multidrop.cli.main([word.format(port) for word in words]) == 2
-    assert "there is no spy://" in capsys.readouterr().err
+    assert "the scheme spy:// is not supported" in capsys.readouterr().err
     assert (tmp_path / "precious").read_text() == "precious"

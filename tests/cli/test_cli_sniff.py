@@ -379,7 +379,10 @@ def test_the_sniff_command_reports_a_port_that_cannot_be_opened(run: Run, tmp_pa
         ("socket://127.0.0.1:9", "nothing listens there"),
     ):
         assert run("sniff", port) == (1, "", f"multidrop: {port}: {sentence}\n")
-    port, sentence = "socket://127.0.0.1", "it needs a host and a port number, such as socket://10.0.0.7:4001"
+    port, sentence = (
+        "socket://127.0.0.1",
+        "the URL needs a host and a port number, such as socket://10.0.0.7:4001",
+    )
     assert run("sniff", port) == (2, "", f"multidrop: {port}: {sentence}\n")
 
 

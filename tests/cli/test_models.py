@@ -75,7 +75,7 @@ def test_a_model_file_is_loaded_once_so_its_drives_share_a_class(fan: Path) -> N
 def test_a_class_missing_in_a_model_file_is_reported(fan: Path) -> None:
     here = fan.parent
     assert refused("fun.py:Fan", here) == f"the model file {here}/fun.py does not exist"
-    assert refused("fan.py", here) == "fan.py names no class; write fan.py:Fan"
+    assert refused("fan.py", here) == "fan.py needs the name of a class after a colon; write fan.py:Fan"
     assert refused("fan.py:Pan", here) == "fan.py has no class 'Pan'; write fan.py:Fan"
     for name in ("Empty", "LIMIT", "Drive"):
         expected = f"fan.py:{name} is not a subclass of multidrop.Drive with registers; write fan.py:Fan"
@@ -284,7 +284,7 @@ def test_the_models_command_prints_every_register_of_a_family_as_json(run: Run) 
             "erman-er-g-220",
             [
                 "b.010 address (1 from the factory), set while the motor stands",
-                "remote b.001 must be 2 and b.002 5 (RS-485)",
+                "remote b.001 must be 2 and b.002 must be 5 (RS-485)",
                 "broadcast the manual does not say whether drives reply to address 0, so none is sent",
                 "coils (read 01H, at most 12; write 05H)",
                 "only verbs write it, except ON",
@@ -309,7 +309,10 @@ def test_the_models_command_prints_every_register_of_a_family_as_json(run: Run) 
                 "remote set Prb.01",
             ],
         ),
-        ("delixi-modbus", ["P04.30 address", "P00.00 must be 2 (RS-485), and P00.01 1", "0 ASCII_7N2"]),
+        (
+            "delixi-modbus",
+            ["P04.30 address", "(RS-485), and P00.01 must be 1", "0 ASCII_7N2"],
+        ),
         (
             "delixi-native",
             [

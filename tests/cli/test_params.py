@@ -168,7 +168,7 @@ def test_the_params_command_compares_two_files_and_two_drives(run: Run, drive: t
         (("diff", "newest.toml"), "give two sides to compare"),
         (("save", "DRIVE", "other.toml"), "other.toml exists already, and is not replaced"),
         (("save", "DRIVE"), "give a drive, and then the name of one file for its parameters"),
-        (("list", "invt-che"), "no reliable rule"),
+        (("list", "invt-che"), "addresses of parameters are not known"),
     ],
 )
 def test_wrong_arguments_of_the_params_command_are_reported_in_one_sentence(

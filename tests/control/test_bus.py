@@ -227,7 +227,7 @@ MISTAKES: dict[type[Exception], list[tuple[Callable[[Bus, Any], Any], str]]] = {
         ),
         (
             lambda bus, rig: bus.attach(Toy, 2, name=cast(Any, 5)),
-            "the name 5 is not one line of printable characters",
+            "the name 5 must be one line of printable characters",
         ),
         (lambda bus, rig: rig.read("targets"), "Rig has no register 'targets'; did you mean target?"),
         (lambda bus, rig: rig.write("targets", 5.0), "Rig has no register 'targets'; did you mean target?"),
@@ -244,9 +244,15 @@ MISTAKES: dict[type[Exception], list[tuple[Callable[[Bus, Any], Any], str]]] = {
             lambda bus, rig: rig.read([rig.target]),
             "is not a Register of pump: pass attributes of the drive, or drive.register(NAME)",
         ),
-        (lambda bus, rig: rig.read(), "read of pump takes registers or their names; read_all() reads all"),
-        (lambda bus, rig: bus.watchdog([rig]), "is not a drive: use the one that attach returns"),
-        (lambda bus, rig: bus.check_identity([rig]), "is not a drive: use the one that attach returns"),
+        (
+            lambda bus, rig: rig.read(),
+            "read() of pump needs registers or their names; read_all() reads all",
+        ),
+        (lambda bus, rig: bus.watchdog([rig]), "is not a drive: pass the drive that bus.attach() returned"),
+        (
+            lambda bus, rig: bus.check_identity([rig]),
+            "is not a drive: pass the drive that bus.attach() returned",
+        ),
         (lambda bus, rig: rig.send_raw(16, 0, 5), r"data = 5: it must be bytes, such as b'\x00\x01'"),
         (lambda bus, rig: rig.register(5), "5 is not a register's name, such as 'speed'"),
         (
@@ -263,7 +269,7 @@ MISTAKES: dict[type[Exception], list[tuple[Callable[[Bus, Any], Any], str]]] = {
         ),
         (
             lambda bus, rig: bus.detach(cast(Any, "pump")),
-            "'pump' is not a drive: use the one that attach returns",
+            "'pump' is not a drive: pass the drive that bus.attach() returned",
         ),
         (
             lambda bus, rig: bus.attach(dict, 2),

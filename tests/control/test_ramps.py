@@ -349,7 +349,7 @@ def test_an_invalid_gap_starts_no_motor() -> None:
 
 def test_wrong_arguments_of_a_ramp_raise_type_error_before_any_frame() -> None:
     line, drive, _ = one(YD1000(1))
-    with pytest.raises(TypeError, match="is not a drive: use the one that attach returns"):
+    with pytest.raises(TypeError, match=r"is not a drive: pass the drive that bus.attach\(\) returned"):
         ramp(cast(Any, [drive]), 20.0)
     with pytest.raises(TypeError, match="rate = '1' is not a number"):
         ramp(drive, 20.0, rate=cast(Any, "1"))

@@ -350,7 +350,9 @@ def test_a_read_raises_an_error_if_a_raw_count_is_invalid() -> None:
     assert (lack.value.register, dict(lack.value.values)) == ("level", {"speed": 20})
     # the write is allowed although the register held an invalid count before
     assert drive.write(drive.limit, 7) == 7
-    with pytest.raises(ValueError, match=r"limit = 65535 is the raw count that stands for a missing value$"):
+    with pytest.raises(
+        ValueError, match=r"limit = 65535 cannot be written: its raw count stands for a missing"
+    ):
         drive.write(drive.limit, 0xFFFF)
     assert sim["limit"] == 7
 

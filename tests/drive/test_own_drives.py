@@ -149,8 +149,8 @@ def test_a_start_needs_confirmation_if_the_drive_cannot_be_identified(name: str)
     with pytest.raises(WriteForbidden) as refusal:
         command_it(line, pump)
     assert str(refusal.value) == (
-        f"{name} is not sent to pump: its class cannot identify a Pump, and the same write may start "
-        "another make: read the drive's name plate; then declare confirmed = 1"
+        f"{name} is not sent to pump: its class cannot identify a Pump, and the write may start a motor "
+        "on a drive of another maker. Read the drive's name plate, then declare confirmed = 1"
     )
     assert line.frames == []
     line.bus.detach(pump)

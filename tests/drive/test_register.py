@@ -406,8 +406,8 @@ def test_a_text_register_cannot_be_polled_or_read_from_another_family() -> None:
 @table(
     ("details", "sentence"),
     [
-        ((1, 0), "a text has 0 registers"),
-        ((1, 126), "a text has 126 registers; it must have 1 to 125"),
+        ((1, 0), "length = 0 of a text is not 1 to 125"),
+        ((1, 126), "length = 126 of a text is not 1 to 125 registers"),
         ((0xFFFF, 2), "its registers must be within 0 to FFFFH"),
         ((-1, 2), "its registers must be within 0 to FFFFH"),
     ],
@@ -421,7 +421,7 @@ def test_invalid_text_register_in_a_drive_class_is_refused() -> None:
     with pytest.raises(ValueError, match="a text has order = 'CDAB'; it must be 'AB', 'BA' or 'B'"):
         text(1, 2, order="CDAB")
     with pytest.raises(
-        ValueError, match="a text has the table 'coil'; it must be in holding or input registers"
+        ValueError, match="a text has the table 'coil'; a text must be in holding or input registers"
     ):
         text(1, 2, table=COIL)
     with pytest.raises(DeclarationError, match="bus: reserved name"):

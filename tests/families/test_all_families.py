@@ -98,7 +98,7 @@ def test_every_family_names_its_rs485_terminals(family: type[Drive]) -> None:
 
 def test_the_error_for_an_unknown_framing_names_a_valid_one() -> None:
     with pytest.raises(
-        ValueError, match=r"^framing 'ascii' is not supported by .*, which has delixi; write delixi, or leave"
+        ValueError, match=r"^framing 'ascii' is not supported by .*, which has delixi; write delixi, or omit"
     ):
         DelixiNative(1, framing="ascii")
 

@@ -147,14 +147,16 @@ def test_delixi_jog_sends_the_control_word_of_its_direction() -> None:
 @table("name", ["start", "jog"])
 def test_delixi_start_is_unconfirmed_if_the_motor_does_not_run(name: str) -> None:
     wire = Wire(DelixiModbus(1), MODBUS_STANDING)
-    with pytest.raises(Unconfirmed, match="it is not seen to run; stop it, or it may start later"):
+    with pytest.raises(
+        Unconfirmed, match=r"reports no run within .* s\. Stop it, or its motor may start later"
+    ):
         getattr(wire.drive, name)()
     assert len(wire.sent) == 1
 
 
 def test_delixi_start_of_a_turning_motor_without_a_direction_is_refused() -> None:
     wire = Wire(DelixiModbus(1), {**MODBUS_STANDING, **MODBUS_TURNING})
-    with pytest.raises(WriteForbidden, match="give the direction"):
+    with pytest.raises(WriteForbidden, match="give a direction, forward or reverse"):
         wire.drive.start()
     assert wire.sent == []
     wire.drive.start(Direction.FORWARD)
@@ -317,7 +319,7 @@ def test_delixi_native_start_without_a_known_setpoint_is_refused() -> None:
     [
         (DelixiNativeStatus.UNDERVOLTAGE, r"a fault, UNDERVOLTAGE: .*reset_fault\(\)"),
         (DelixiNativeStatus.FAULT, r"a fault, FAULT: .*reset_fault\(\)"),
-        (9, "reports 0009H in reply to K = 03, a state that the manual does not explain"),
+        (9, "reports state 0009H in its reply to K = 03, which the manual does not explain"),
     ],
 )
 def test_delixi_native_start_is_refused_if_the_motor_could_start_later(status: int, sentence: str) -> None:
@@ -333,8 +335,8 @@ def test_delixi_native_start_is_refused_if_the_motor_could_start_later(status: i
 @table(
     ("says", "sentence"),
     [
-        ({"run_source": DelixiRunSource.KEYPAD}, "does not take its commands from the line"),
-        ({"fault": DelixiFault.OC_OVERCURRENT}, "has a fault, overcurrent .OC.: remove its cause"),
+        ({"run_source": DelixiRunSource.KEYPAD}, "does not take commands from the line"),
+        ({"fault": DelixiFault.OC_OVERCURRENT}, "has a fault, overcurrent .OC.: remove the cause"),
     ],
 )
 def test_delixi_native_start_needs_line_control_and_no_fault(says: dict[str, object], sentence: str) -> None:
@@ -348,7 +350,9 @@ def test_delixi_native_start_needs_line_control_and_no_fault(says: dict[str, obj
 def test_delixi_native_start_is_unconfirmed_if_the_motor_is_not_seen_to_run() -> None:
     wire = Wire(DelixiNative(1), NATIVE_STANDING)
     wire.drive.set_frequency(50)
-    with pytest.raises(Unconfirmed, match="it is not seen to run; stop it, or it may start later"):
+    with pytest.raises(
+        Unconfirmed, match=r"reports no run within .* s\. Stop it, or its motor may start later"
+    ):
         wire.drive.start()
     assert wire.sent == [NATIVE_FIFTY, NATIVE_FORWARD]
 

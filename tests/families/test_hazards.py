@@ -134,7 +134,7 @@ HAZARDS = {
         yd, frequency(28.5), naive="01 06 00 02 01 1D", sends=("01 06 10 01 0B 22",)
     ),
     "0.2: change of direction is a toggle (IBD, bits 2 and 3)": Hazard(
-        ibd, direct(Direction.REVERSE), naive="01 06 20 00 00 0E", refuses="ambiguous"
+        ibd, direct(Direction.REVERSE), naive="01 06 20 00 00 0E", refuses="does not say"
     ),
     "0.6: reset and start in one frame (YD1000)": Hazard(
         yd,
@@ -188,7 +188,7 @@ HAZARDS = {
         stop,
         naive="01 05 00 00 FF 00",
         sends=("01 05 00 01 FF 00", "01 05 00 00 00 00", "01 05 00 02 FF 00"),
-        refuses="not seen to have stopped",
+        refuses="does not report a stop within",
         error=Unconfirmed,
         shows={"status": ErmanStatus.RUNNING},
     ),
@@ -234,7 +234,7 @@ HAZARDS = {
         shows={"frequency_source": 3},
     ),
     "N2: which bit is forward is ambiguous": Hazard(
-        ibd, direct(Direction.FORWARD), naive="01 06 20 00 00 0A", refuses="ambiguous"
+        ibd, direct(Direction.FORWARD), naive="01 06 20 00 00 0A", refuses="does not say"
     ),
     "N7: the setpoint's range ignores the drive's maximum": Hazard(
         lambda: ibd(maximum_frequency=60),

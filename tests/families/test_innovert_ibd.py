@@ -150,7 +150,7 @@ def test_innovert_ibd_gets_a_stop_before_the_fault_reset() -> None:
 def test_innovert_ibd_start_with_a_direction_needs_the_option_forward_bit(direction: Direction) -> None:
     wire = Wire(InnovertIBD(1))
     for verb in (wire.drive.start, wire.drive.jog):
-        with pytest.raises(WriteForbidden, match="ambiguous"):
+        with pytest.raises(WriteForbidden, match="does not say whether bit 2 or 3"):
             verb(direction)
     assert wire.sent == []
 
@@ -188,7 +188,8 @@ def test_innovert_ibd_start_and_jog_of_a_turning_motor_are_refused(turning: dict
     wire.drive.set_frequency(50)
     for verb in (wire.drive.start, wire.drive.jog):
         with pytest.raises(
-            WriteForbidden, match=r"turns, and no register shows whether it jogs: call stop\(\) first"
+            WriteForbidden,
+            match=r"turns, and no register shows if this is a jog: call stop\(\) first",
         ):
             verb()
     assert wire.sent == [FIFTY[Framing.RTU]]
@@ -238,7 +239,9 @@ def test_innovert_ibd_identity_check_needs_its_address_or_a_confirmation() -> No
 def test_innovert_ibd_start_is_unconfirmed_if_current_and_speed_stay_0() -> None:
     wire = Wire(InnovertIBD(1), STANDING | {"terminals": Terminals(0)})
     wire.drive.set_frequency(50)
-    with pytest.raises(Unconfirmed, match="it is not seen to run; stop it, or it may start later"):
+    with pytest.raises(
+        Unconfirmed, match=r"reports no run within .* s\. Stop it, or its motor may start later"
+    ):
         wire.drive.start()
     assert wire.sent == [FIFTY[Framing.RTU], RUN[Framing.RTU]]
 

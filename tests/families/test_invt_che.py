@@ -133,7 +133,7 @@ def test_invt_che_start_without_a_direction_keeps_a_running_motors_direction() -
 
 
 TURNS_ALREADY = r"already turns, and a jog must start from rest: call stop\(\) first"
-UNDOCUMENTED = "has 0005H at 1001H, a state that the manual does not explain"
+UNDOCUMENTED = "shows state 0005H in 1001H, which the manual does not explain"
 
 
 @table(

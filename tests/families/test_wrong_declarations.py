@@ -176,7 +176,7 @@ def test_delta_drive_declared_as_a_goodrive_is_stopped_but_gets_no_coast() -> No
 
 def test_the_error_for_a_wrongly_declared_chf100a_names_its_model() -> None:
     pair = Pair("invt-che", "invt-chf100a", turns=True)
-    with pytest.raises(WriteForbidden, match="declare model invt-chf100a"):
+    with pytest.raises(WriteForbidden, match="declare model = invt-chf100a"):
         pair.drive.start()
     assert pair.bus.written == []
     pair.drive.stop()

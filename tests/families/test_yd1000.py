@@ -334,8 +334,8 @@ def test_yd1000_start_waits_until_1202h_shows_the_preset_speed(number: int, bits
     ("says", "sent", "sentence"),
     [
         ({}, [STOP, yd_word(0xC00C), STOP], "speed 3 was selected, its frequency command did not become 15"),
-        ({"reference_frequency": 15.0}, [STOP], "selection of preset speed 3 could not be verified"),
-        ({"preset_speed_3": 0.0}, [], "is 0: set preset_speed_3 first"),
+        ({"reference_frequency": 15.0}, [STOP], "preset speed 3 cannot be verified"),
+        ({"preset_speed_3": 0.0}, [], "is 0: write preset_speed_3 first"),
         ({**TURNS[FORWARD]}, [], r"turns, and a preset speed .*: call stop\(\) first"),
         ({"held_frequency": 30.0}, [], r"has a fault.*reset_fault\(\)"),
     ],
@@ -439,7 +439,8 @@ def test_yd1000_start_after_a_reset_requires_a_new_setpoint() -> None:
     wire.sent.clear()
     wire.say({"frequency": 20.0})
     with pytest.raises(
-        WriteForbidden, match=r"holds 20\.00 Hz and not 30\.00 Hz .* call set_frequency before start"
+        WriteForbidden,
+        match=r"setpoint 20\.00 Hz, not the written 30\.00 Hz.* call set_frequency before",
     ):
         wire.drive.start()
     assert wire.sent == []
@@ -472,15 +473,15 @@ FUNCTIONS = {f"input_{at}_function": factory for at, factory in enumerate((2.0, 
     ("verb", "consequence"),
     [
         # A restart may clear bit 15 of the control word, as power-on does (8.1). Then terminals have control.
-        ("reset_fault", ", and may start the motor"),
-        ("release_control", ", .* once the line no longer commands it"),
+        ("reset_fault", " and may start the motor"),
+        ("release_control", " .* when the line releases control"),
     ],
 )
 def test_a_closed_run_terminal_prevents_a_yd1000_reset_or_release(
     says: dict[str, object], terminal: str, verb: str, consequence: str
 ) -> None:
     wire = Wire(YD1000(1), {**STANDING, **FUNCTIONS, **says})
-    with pytest.raises(WriteForbidden, match=f"^{terminal}.* is set to run{consequence}"):
+    with pytest.raises(WriteForbidden, match=f"^{terminal}.* has a run function{consequence}"):
         getattr(wire.drive, verb)()
     assert wire.sent == []
 
@@ -638,7 +639,7 @@ def test_yd1000_start_after_an_emergency_stop_at_rest_advises_reset_fault() -> N
     _, drive, _ = one(YD1000(1))
     drive.emergency_stop()
     drive.set_frequency(30)
-    with pytest.raises(Unconfirmed, match=r"not seen to run; .*emergency stop the drive needs reset_fault"):
+    with pytest.raises(Unconfirmed, match=r"no run within .*emergency stop the drive needs reset_fault"):
         drive.start()
 
 

@@ -416,7 +416,8 @@ def test_verbs_and_writes_are_answered_with_their_results(gateway: Served) -> No
     assert act("set_frequency", hz=10**400).endswith("0 is not a number")
     assert act("set_frequency", hz=None) == "set_frequency needs a frequency: hz = 20.0"
     assert act("set_frequency", hz=20) == (
-        "pump-1 takes its setpoint in percent of P0.04: write maximum_frequency = HZ below its [[line.drive]]"
+        "pump-1 takes its setpoint in percent of P0.04, the maximum frequency: write maximum_frequency = HZ "
+        "below its [[line.drive]]"
     )
 
 

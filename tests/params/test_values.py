@@ -150,7 +150,8 @@ def test_a_delixi_e_parameter_without_explanation_is_not_writable() -> None:
 def test_a_family_without_parameter_addresses_raises_unsupported() -> None:
     _, drive, _ = one(InvtCHE(1))
     with pytest.raises(
-        Unsupported, match=r"no reliable rule .* invt-che: read and write its declared registers instead"
+        Unsupported,
+        match=r"are not known for invt-che: read and write its declared registers instead",
     ):
         params.read(drive)
 

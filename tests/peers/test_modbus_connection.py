@@ -186,7 +186,7 @@ def test_unsupported_functions_and_parameters_are_refused_in_one_sentence() -> N
     for params in (neutral.ModbusUdpParams(host="h"), neutral.ModbusTlsParams(host="h")):
         with pytest.raises(ValueError, match=r"multidrop does not support Modbus\w+Params: use"):
             ours.ModbusConnection(params)
-    with pytest.raises(ValueError, match="there is no esphome://"):
+    with pytest.raises(ValueError, match="the scheme esphome:// is not supported"):
         ours.ModbusConnection(neutral.ModbusSerialParams(device="esphome://proxy"))
 
     async def use(connection: Any, registers: Registers) -> None:

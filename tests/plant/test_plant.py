@@ -285,8 +285,8 @@ def test_all_mistakes_in_a_plant_file_are_reported_together(mistakes: Mistakes) 
         ),
         (
             HEAD + 'silence = "500 us"\n' + TOY,
-            'line "L", drive "D": silence 500 us is too short at 9600 8N1: a frame may contain pauses of 1.5 '
-            "characters, so it must be 1563 us or more",
+            'line "L", drive "D": silence 500 us is too short at 9600 8N1: write 1563 us or more, '
+            "because a frame may contain pauses of 1.5 characters",
         ),
         (HEAD + 'silence = "2 s"\n' + TOY, 'line "L", drive "D": silence 2.0 is not a time from 0 to 1 s'),
         (HEAD + 'echo = "loud"\n' + TOY, 'line "L": echo \'loud\' is none of "auto", "on" and "off"'),
@@ -432,7 +432,7 @@ def test_all_mistakes_in_a_plant_file_are_reported_together(mistakes: Mistakes) 
         ),
         (
             HEAD.replace("/dev/a", "socket://10.0.0.9") + TOY,
-            'line "L": socket://10.0.0.9: it needs a host and a port number, such as socket://10.0.0.7:4001',
+            'line "L": socket://10.0.0.9: the URL needs a host and a port number, such as socket://10.0.0.7:4001',
         ),
     ],
 )
@@ -540,14 +540,14 @@ def test_a_port_url_with_an_undocumented_scheme_is_refused(mistakes: Mistakes, p
     (sentence,) = mistakes((HEAD + TOY).replace('port = "/dev/a"', f'port = "{port}"'))
     scheme = port.partition(":")[0]
     assert sentence.endswith(
-        f"there is no {scheme}://; a URL is such as tcp://10.0.0.7, socket://10.0.0.7:4001 or "
-        "rfc2217://10.0.0.7:4001"
+        f"the scheme {scheme}:// is not supported; write a URL such as tcp://10.0.0.7, "
+        "socket://10.0.0.7:4001 or rfc2217://10.0.0.7:4001"
     )
 
 
 def test_a_port_url_with_a_user_is_refused_without_showing_the_password(mistakes: Mistakes) -> None:
     (sentence,) = mistakes((HEAD + TOY).replace('port = "/dev/a"', 'port = "tcp://bob:S3C@ET@10.0.0.7"'))
-    assert "tcp://10.0.0.7: it has a user or a password" in sentence
+    assert "tcp://10.0.0.7: a port takes no user name and no password" in sentence
     assert "S3C" not in sentence
 
 
@@ -560,7 +560,7 @@ def test_reserved_names_of_lines_and_drives_are_refused(mistakes: Mistakes) -> N
 def test_a_family_file_name_that_is_too_long_is_reported(mistakes: Mistakes) -> None:
     (sentence,) = mistakes(HEAD + TOY.replace("family.py:Toy", "a" * 300 + ".py"))
     # Windows has the second text
-    assert sentence.endswith((".py: File name too long", ".py does not exist"))
+    assert sentence.endswith((".py cannot be read: File name too long", ".py does not exist"))
 
 
 @table(
@@ -616,7 +616,7 @@ def test_the_options_of_a_drive_are_read_from_the_plant_file(tmp_path: Path) -> 
     with pytest.raises(PlantError, match="did you mean acceleration_time"):
         load_plant(path)
     path.write_text(path.read_text().replace('["acceleration"]', "[3]"))
-    with pytest.raises(PlantError, match="ram takes names of registers, not 3"):
+    with pytest.raises(PlantError, match="the argument ram must hold register names, not 3"):
         load_plant(path)
 
 
@@ -687,7 +687,7 @@ def test_a_text_register_in_a_poll_list_is_a_mistake(mistakes: Mistakes, tmp_pat
         "[reading]\npower = { at = 1 }\n[text]\nmark = { at = 9, length = 4 }\n"
     )
     (sentence,) = mistakes(HEAD + TOY.replace("family.py:Toy", "meter.toml") + 'poll = ["mark"]')
-    assert sentence.endswith("'mark' of Meter is a text: texts are read, but neither polled nor written")
+    assert sentence.endswith("'mark' of Meter is a text, which can be read, but not polled or written")
 
 
 # Letters with a composed and a decomposed Unicode encoding, from the code charts.

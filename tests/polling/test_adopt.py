@@ -410,7 +410,7 @@ def test_all_mistakes_of_a_new_plant_are_reported_together() -> None:
 def test_an_invalid_port_name_in_a_new_plant_changes_nothing() -> None:
     with clocked(hall(*pumps())) as made:
         made.run(1)
-        with pytest.raises(NoSuchPort, match="it needs a host and a port number"):
+        with pytest.raises(NoSuchPort, match="the URL needs a host and a port number"):
             made.poller.adopt(plant(line("socket://nowhere", toy("v", 1))))
         assert list(made.poller.buses) == ["hall"]
 

@@ -147,7 +147,7 @@ def test_a_csv_file_cut_at_any_byte_loses_only_the_last_line(tmp_path: Path) -> 
 
 def test_a_drive_name_with_a_line_end_is_refused() -> None:
     """Otherwise a .csv that is cut off within a name could end with a line that looks complete."""
-    with pytest.raises(ValueError, match=r"the name 'pump\\n1' is not one line"):
+    with pytest.raises(ValueError, match=r"the name 'pump\\n1' must be one line"):
         Toy(1, name="pump\n1")
 
 

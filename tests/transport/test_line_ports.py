@@ -216,13 +216,13 @@ def os_words_of_an_unknown_zone() -> str:
             "127.0.0.1:502",
             "for Modbus TCP write tcp://127.0.0.1:502, for RTU over TCP socket://127.0.0.1:502",
         ),
-        ("socket://127.0.0.1", "it needs a host and a port number, such as socket://10.0.0.7:4001"),
-        ("rfc2217://:4001", "it needs a host and a port number, such as rfc2217://10.0.0.7:4001"),
+        ("socket://127.0.0.1", "the URL needs a host and a port number, such as socket://10.0.0.7:4001"),
+        ("rfc2217://:4001", "the URL needs a host and a port number, such as rfc2217://10.0.0.7:4001"),
         ("socket://127.0.0.1:99999", "Port out of range 0-65535"),
         (
             "sokcet://127.0.0.1:4001",
-            "there is no sokcet://; a URL is such as tcp://10.0.0.7, socket://10.0.0.7:4001 or "
-            "rfc2217://10.0.0.7:4001",
+            "the scheme sokcet:// is not supported; write a URL such as tcp://10.0.0.7, "
+            "socket://10.0.0.7:4001 or rfc2217://10.0.0.7:4001",
         ),
         ("socket://[fe80::1%nowhere]:4001", "{unknown}"),
         ("spy://{tmp}/absent", "there is no such port"),
@@ -240,7 +240,7 @@ def test_opening_an_invalid_port_raises_a_one_sentence_error(tmp_path: Path, por
     assert (caught.value.port, caught.value.reason) == (port, reason)
     assert isinstance(caught.value, OSError)
     is_mistaken = any(
-        word in reason for word in ("needs a host", "out of range", "there is no sokcet", "write tcp:")
+        word in reason for word in ("needs a host", "out of range", "the scheme sokcet", "write tcp:")
     )
     assert isinstance(caught.value, ValueError) == is_mistaken
 
@@ -443,6 +443,6 @@ def test_a_file_named_in_a_ports_url_is_not_changed(tmp_path: Path) -> None:
     """pyserial's spy:// empties the file that it names."""
     precious = tmp_path / "precious"
     precious.write_text("precious")
-    with pytest.raises(LineError, match="there is no spy://"):
+    with pytest.raises(LineError, match="the scheme spy:// is not supported"):
         Line(f"spy:///dev/null?file={precious}").open()
     assert precious.read_text() == "precious"

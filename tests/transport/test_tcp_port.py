@@ -88,7 +88,7 @@ def test_the_default_tcp_port_is_502(name: str, opened: str, identity: str) -> N
 
 @table("name", ["tcp://", "tcp://:502", "tcp://10.0.0.7:0", "tcp://10.0.0.7:99999"])
 def test_an_invalid_tcp_url_raises_a_one_sentence_error(name: str) -> None:
-    with pytest.raises(NoSuchPort, match=r"it needs a host, such as tcp://10\.0\.0\.7|Port out of range"):
+    with pytest.raises(NoSuchPort, match=r"needs a host, such as tcp://10\.0\.0\.7|Port out of range"):
         Bus(name)
 
 
@@ -121,7 +121,7 @@ def test_an_attached_drive_uses_the_framing_of_its_port(port: str) -> None:
     [
         (InnovertIBD(1, framing="rtu"), "framing rtu is for serial lines, but tcp://.* speaks Modbus TCP"),
         (InnovertIBD(1, framing="ascii"), "framing ascii is for serial lines"),
-        (DelixiNative(1), "does not speak Modbus, and a tcp:// port such as tcp://.* carries nothing else"),
+        (DelixiNative(1), "does not speak Modbus, but the port tcp://.* carries only Modbus TCP"),
     ],
 )
 def test_another_framing_on_a_tcp_port_is_refused_in_one_sentence(
@@ -152,7 +152,7 @@ def test_unit_ids_of_modbus_tcp_are_refused_on_serial_ports() -> None:
 
     with Simulator([Wire([simulated(InnovertIBD(9))])]) as line, Bus(line.wires[0].path) as bus:
         for address in (0, 248, 255):
-            with pytest.raises(ValueError, match=f"address {address} is a unit id of Modbus TCP"):
+            with pytest.raises(ValueError, match=f"address {address} is valid only on Modbus TCP"):
                 bus.attach(Both, address)
 
 

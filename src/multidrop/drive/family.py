@@ -186,7 +186,7 @@ class Drive(RegisterAccess):
         except KeyError:
             if name in cls.texts:
                 raise ValueError(
-                    f"{name!r} of {cls._kind()} is a text: texts are read, but neither polled nor written"
+                    f"{name!r} of {cls._kind()} is a text, which can be read, but not polled or written"
                 ) from None
             hint = did_you_mean(name, cls.registers, f"see `multidrop models {cls.model}`", 3)
             raise ValueError(f"{cls._kind()} has no register {name!r}; {hint}") from None
@@ -245,7 +245,7 @@ class Drive(RegisterAccess):
         )
         self.name = name or f"{self.model or type(self).__name__}@{address}"
         if not (isinstance(self.name, str) and self.name.isprintable()):  # a line break would split a row
-            raise ValueError(f"the name {name!r} is not one line of printable characters")
+            raise ValueError(f"the name {name!r} must be one line of printable characters")
         self.option = checked_options(self._kind(), self.options, options)
         self.ram = frozenset(self._in_ram(name) for name in ram)
         self._known_setpoint = KnownSetpoint()
@@ -274,7 +274,7 @@ class Drive(RegisterAccess):
         if framing in cls.framings or (framing is Framing.TCP and cls.speaks(framing)):
             return Framing(framing)
         known = ", ".join(str(one) for one in cls.framings)
-        hint = f"; write {known}, or leave it out" if len(cls.framings) == 1 else ""
+        hint = f"; write {known}, or omit framing" if len(cls.framings) == 1 else ""
         raise ValueError(
             f"framing {str(framing)!r} is not supported by {cls._kind()}, which has {known}{hint}"
         )
@@ -282,10 +282,10 @@ class Drive(RegisterAccess):
     @classmethod
     def _in_ram(cls, name: str) -> str:
         if not isinstance(name, str):
-            raise TypeError(f"ram takes names of registers, not {name!r}")
+            raise TypeError(f"the argument ram must hold register names, not {name!r}")
         register = cls.register(name)
         if register.kept is Kept.EEPROM:
-            raise ValueError(f"{name} of {cls._kind()} is kept in EEPROM, according to its document")
+            raise ValueError(f"{name} of {cls._kind()} cannot be in ram: the manual says it is in EEPROM")
         return register.name
 
     def take_framing_of(self, port: str) -> None:
@@ -365,7 +365,7 @@ class Drive(RegisterAccess):
             return
         if why := doubt(self._kind(), self.declared_in, identifies=self._identifies()):
             raise WriteForbidden(
-                f"{what} is not sent to {self.name}: {why}; then declare confirmed = 1",
+                f"{what} is not sent to {self.name}: {why}, then declare confirmed = 1",
                 rule="the drive is not confirmed",
                 advice=Advice.declare("confirmed", 1),
             )
@@ -409,7 +409,7 @@ class Drive(RegisterAccess):
     def _stopped(self, check: Callable[[], Script[bool]], limit: float) -> Script[None]:
         """Wait until `check` sees that the drive has stopped. Raises Unconfirmed after `limit` seconds."""
         if not (yield from until(check, limit=limit)):
-            raise Unconfirmed(self.name, "the stop", f"after {limit:g} s it is not seen to have stopped")
+            raise Unconfirmed(self.name, "the stop", f"the drive does not report a stop within {limit:g} s")
 
     def _write_setpoint(self, register: Register[float], value: float) -> Script[None]:
         """Write the setpoint. Raises NotVerified if the drive then holds another value."""
@@ -427,8 +427,8 @@ class Drive(RegisterAccess):
         elif held == 0:
             problem = f"the setpoint of {self.name} is 0:"
         elif self.commanded is not None and held != self.commanded:
-            shown = f"{register.format(held)} and not {register.format(self.commanded)}"
-            problem = f"{self.name} holds {shown} as written: it may have lost its power;"
+            shown = f"the setpoint {register.format(held)}, not the written {register.format(self.commanded)}"
+            problem = f"{self.name} holds {shown}, perhaps after a power loss:"
         else:
             return
         raise WriteForbidden(f"{problem} call set_frequency before start", advice=_SETPOINT_FIRST)
@@ -449,14 +449,14 @@ class Drive(RegisterAccess):
         not seen to run in time.
         """
         if not (yield from until(self._runs, limit=START_TIME)):
-            seen = f"after {START_TIME:g} s it is not seen to run; stop it, or it may start later"
+            seen = f"the drive reports no run within {START_TIME:g} s. Stop it, or its motor may start later"
             raise Unconfirmed(self.name, "the start", f"{seen}; {self.remote}")
         if direction is None:
             return
         limit = self.option.get("stop_time", REVERSAL_TIME) + START_TIME
         if not (yield from until(lambda: self._turns_in(direction), limit=limit)):
             way = "in reverse" if direction is Direction.REVERSE else "forward"
-            seen = f"after {limit:g} s it is not seen to turn {way}; stop it, or it may later"
+            seen = f"the drive does not report it within {limit:g} s. Stop it, or it may turn {way} later"
             raise Unconfirmed(self.name, f"the start {way}", seen)
 
     def _runs(self) -> Script[bool]:
@@ -564,7 +564,7 @@ def verbs_of(drive: Drive) -> list[str]:
 def check_drive(drive: Drive) -> None:
     """Raise TypeError unless `drive` is a Drive."""
     if not isinstance(drive, Drive):
-        raise TypeError(f"{drive!r} is not a drive: use the one that attach returns")
+        raise TypeError(f"{drive!r} is not a drive: pass the drive that bus.attach() returned")
 
 
 def check_own(drive: Drive, register: Register[Any]) -> None:

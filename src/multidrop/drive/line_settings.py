@@ -78,9 +78,9 @@ def check_port(port: str) -> str:
     """
     scheme, is_url, _ = port.partition("://")
     if is_url and scheme.lower() not in SCHEMES:
-        raise NoSuchPort(masked(port), f"there is no {scheme}://; a URL is such as {URLS}")
+        raise NoSuchPort(masked(port), f"the scheme {scheme}:// is not supported; write a URL such as {URLS}")
     if is_url and url_of(port).username is not None:
-        raise NoSuchPort(masked(port), "it has a user or a password, which no port takes: remove it")
+        raise NoSuchPort(masked(port), "a port takes no user name and no password: remove them from the URL")
     url_of(port)
     return port
 
@@ -101,9 +101,13 @@ def url_of(port: str) -> SplitResult:
     except ValueError as mistake:
         raise NoSuchPort(port, str(mistake)) from mistake
     if url.scheme == "tcp" and (not host or number == 0):
-        raise NoSuchPort(port, f"it needs a host, such as tcp://10.0.0.7 or tcp://10.0.0.7:{MODBUS_PORT}")
+        raise NoSuchPort(
+            port, f"the URL needs a host, such as tcp://10.0.0.7 or tcp://10.0.0.7:{MODBUS_PORT}"
+        )
     if url.scheme in ("socket", "rfc2217") and not (host and number):
-        raise NoSuchPort(port, f"it needs a host and a port number, such as {url.scheme}://10.0.0.7:4001")
+        raise NoSuchPort(
+            port, f"the URL needs a host and a port number, such as {url.scheme}://10.0.0.7:4001"
+        )
     return url
 
 
@@ -133,20 +137,20 @@ def framing_on(
     if speaks_tcp(port):
         if declared not in (None, Framing.TCP):
             raise ValueError(
-                f"framing {wanted} is for serial lines, but {port} speaks Modbus TCP: remove framing, or "
-                f"write socket:// if the far end forwards serial bytes"
+                f"framing {wanted} is for serial lines, but {port} speaks Modbus TCP. Remove the framing, or "
+                "write socket:// instead of tcp:// if the server forwards serial bytes"
             )
         if not speaks_modbus:
             raise ValueError(
-                f"{family} does not speak Modbus, and a tcp:// port such as {port} carries nothing else: "
-                f"write socket://, and set the far end to forward serial bytes"
+                f"{family} does not speak Modbus, but the port {port} carries only Modbus TCP. Write "
+                "socket:// instead of tcp://, and set the server to forward serial bytes"
             )
         return Framing.TCP
     if wanted is Framing.TCP:
         raise ValueError(f"framing tcp is for tcp:// ports, such as tcp://10.0.0.7:502, not for {port}")
     if address not in SERIAL_ADDRESSES:
         raise ValueError(
-            f"address {address} is a unit id of Modbus TCP; on {port} it must be "
+            f"address {address} is valid only on Modbus TCP; on {port} an address must be "
             f"{SERIAL_ADDRESSES[0]} to {SERIAL_ADDRESSES[-1]}"
         )
     return wanted
@@ -163,6 +167,6 @@ def check_agreed_silence(agreed: float, settings: Settings, own: float | None) -
     least = 1.5 * settings.character
     if own is not None and max(agreed, own) < least:
         raise ValueError(
-            f"silence {agreed * 1e6:g} us is too short at {settings}: a frame may contain pauses of 1.5 "
-            f"characters, so it must be {math.ceil(least * 1e6)} us or more"
+            f"silence {agreed * 1e6:g} us is too short at {settings}: write {math.ceil(least * 1e6)} us or "
+            "more, because a frame may contain pauses of 1.5 characters"
         )

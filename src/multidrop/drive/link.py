@@ -99,7 +99,7 @@ class RegisterAccess:
         name, and NotAttached if the drive is not attached to a bus.
         """
         if not wanted:
-            raise TypeError(f"read of {self.name} takes registers or their names; read_all() reads all")
+            raise TypeError(f"read() of {self.name} needs registers or their names; read_all() reads all")
         found = self.read_many(wanted)
         return found if len(wanted) > 1 else next(iter(found.values()))
 

@@ -53,12 +53,12 @@ def doubt(family: str, declared_in: str, *, identifies: bool) -> str:
     """Return why the owner must confirm that a drive is of this class; "" if that is not needed."""
     if declared_in:
         return (
-            f"its class is the untested file {declared_in}: compare `multidrop check {declared_in}` with the "
-            "manual, and read the drive's name plate"
+            f"the family file {declared_in} is not confirmed for this drive. Compare the output of "
+            f"`multidrop check {declared_in}` with the manual, read the drive's name plate"
         )
     if not identifies:
         return (
-            f"its class cannot identify a {family}, and the same write may start another make: read the "
-            "drive's name plate"
+            f"its class cannot identify a {family}, and the write may start a motor on a drive of another "
+            "maker. Read the drive's name plate"
         )
     return ""

@@ -132,7 +132,7 @@ def _parameters_of(family: Any) -> Mapping[str, Parameter]:
     space: ParameterSpace | None = family.parameter_space
     if space is None:
         raise Unsupported(
-            f"there is no reliable rule for the parameter addresses of {family.model or family.__name__}: "
+            f"the addresses of parameters are not known for {family.model or family.__name__}: "
             "read and write its declared registers instead"
         )
     declared = {

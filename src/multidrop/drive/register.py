@@ -299,7 +299,7 @@ class Register(Generic[T]):
     def _check_valid(self, raw: float, value: float) -> None:
         if self.invalid and self.coding.raw_of(bits_of(raw, self.number_format)) is None:
             raise ValueError(
-                f"{self.name} = {_short(value)} is the raw count that stands for a missing value"
+                f"{self.name} = {_short(value)} cannot be written: its raw count stands for a missing value"
             )
 
     def _raw(self, value: float) -> float:

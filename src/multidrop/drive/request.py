@@ -123,8 +123,8 @@ def check_no_read(drive: Any, request: Message) -> None:
     if drive.framing is not Framing.DELIXI and request.function in READS:
         asked = f"{request.function}, {request.start}, {request.count}"
         raise ValueError(
-            f"function {request.function:02X}H is a read, which send_raw does not send: call "
-            f"drive.read_raw({asked}), which cannot return another request's late reply"
+            f"send_raw() does not send function {request.function:02X}H, which reads: call "
+            f"drive.read_raw({asked}) instead"
         )
 
 
@@ -149,12 +149,14 @@ def any_read(drive: Any, function: int, start: int, count: int) -> Message:
         raise ValueError(f"start = {start} is not an address from 0 to {_ADDRESSES - 1}")
     if function not in FUNCTIONS:
         if count or (start and function != DEVICE_ID):
-            raise ValueError(f"start = {start}, count = {count}: function {function} reads no addresses")
+            raise ValueError(
+                f"start = {start}, count = {count}: omit both, function {function} reads no addresses"
+            )
         data = bytes([MEI_DEVICE_ID]) + start.to_bytes(2) if function == DEVICE_ID else b""
         return Message(drive.address, function, data=data)
     most = function_limit(drive, function)
     if not 1 <= count <= most:
         raise ValueError(f"count = {count} is outside 1 to {most}, the limit of one request to {drive.name}")
     if start + count > _ADDRESSES:
-        raise ValueError(f"start + count = {start + count}: the last address is {_ADDRESSES - 1}")
+        raise ValueError(f"start + count = {start + count} is beyond the last address, {_ADDRESSES - 1}")
     return Message(drive.address, function, start, count)

@@ -29,14 +29,14 @@ class Text:
 
     def __post_init__(self) -> None:
         if not is_whole(self.length) or not 1 <= self.length <= MOST_WORDS:
-            raise ValueError(f"a text has {self.length!r} registers; it must have 1 to {MOST_WORDS}")
+            raise ValueError(f"length = {self.length!r} of a text is not 1 to {MOST_WORDS} registers")
         if not is_whole(self.address) or not 0 <= self.address <= _LAST_ADDRESS + 1 - self.length:
             raise ValueError(f"a text starts at {self.address!r}; its registers must be within 0 to FFFFH")
         if self.order not in _ORDERS:
             raise ValueError(f"a text has order = {self.order!r}; it must be 'AB', 'BA' or 'B'")
         if not isinstance(self.table, Table) or self.table.read not in (0x03, 0x04):
             other = self.table.name if isinstance(self.table, Table) else self.table
-            raise ValueError(f"a text has the table {other!r}; it must be in holding or input registers")
+            raise ValueError(f"a text has the table {other!r}; a text must be in holding or input registers")
 
     def __set_name__(self, owner: type, name: str) -> None:
         if not self.name:

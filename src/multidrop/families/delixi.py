@@ -164,17 +164,17 @@ class DelixiParameters(Drive):
         address = yield from read(self.address_setting)
         if address != self.address:
             raise WriteForbidden(
-                f"{self.name} has {address:g} as P04.30, not its address {self.address}: it may be another "
-                "make; look at its name plate, and at P04.30 on its keypad"
+                f"{self.name} shows address {address:g} in P04.30, but is declared at address "
+                f"{self.address}. The device may be from another maker: check its name plate, and its P04.30"
             )
         held, declared = (yield from read(self.baudrate_setting)), self.settings.baudrate
         if held == DelixiBaudrate[f"B{declared}"]:
             return
-        named = f", {held.name[1:]} bit/s" if isinstance(held, DelixiBaudrate) else ""
+        named = f" ({held.name[1:]} bit/s)" if isinstance(held, DelixiBaudrate) else ""
         raise WriteForbidden(
-            f"{self.name} has {int(held)} as P04.28{named}, and is declared with {declared} bit/s: declare "
-            f"the drive's own baud rate, even behind a converter; if its keypad shows another P04.28, it is "
-            f"another make"
+            f"{self.name} shows baud rate code {int(held)}{named} in P04.28, but is declared with {declared} "
+            "bit/s. Declare the baud rate of P04.28; if the keypad shows another P04.28, the device is from "
+            "another maker"
         )
 
     def _check_start(self) -> Script[None]:
@@ -182,10 +182,10 @@ class DelixiParameters(Drive):
         fault = yield from read(self.fault)
         if fault:
             raise WriteForbidden(
-                f"{self.name} has a fault, {self.fault.in_words(fault)}: remove its cause and reset it first"
+                f"{self.name} has a fault, {self.fault.in_words(fault)}: remove the cause, then reset it"
             )
         if (yield from read(self.run_source)) != DelixiRunSource.LINE:
-            raise WriteForbidden(f"{self.name} does not take its commands from the line: {self.remote}")
+            raise WriteForbidden(f"{self.name} does not take commands from the line: {self.remote}")
 
     def _stop_limit(self) -> float:
         return self.option.get("stop_time", STOP_TIME)
@@ -256,7 +256,7 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
     exceptions = {}
     broadcasts = True
     identify_recognises = True
-    remote = "P00.00 must be 2 (RS-485), and P00.01 1 (digital setting)"
+    remote = "P00.00 must be 2 (RS-485), and P00.01 must be 1 (digital setting)"
 
     control = command(
         0x2000,
@@ -294,8 +294,8 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
         fault = yield from read(self.fault)
         if not isinstance(fault, type(self.fault.decode(0))):
             raise WriteForbidden(
-                f"{self.name} has {int(fault):04X}H as its present fault (P05.31), a code that the manual "
-                f"does not list: it may be another make; look at its name plate"
+                f"{self.name} shows fault code {int(fault):04X}H in P05.31, which the manual does not list. "
+                "The device may be from another maker: check its name plate"
             )
 
     @verb
@@ -305,7 +305,7 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
             raise self._stop_first(f"{self.name} may still be jogging, and a start might not end the jog")
         forward = yield from self._goes_forward(direction)
         if (yield from read(self.frequency_source)) != 1:
-            raise WriteForbidden(f"{self.name} takes no setpoint from P00.02: set P00.01 to 1 on the keypad")
+            raise WriteForbidden(f"{self.name} ignores the setpoint P00.02: set P00.01 to 1 on the keypad")
         yield from self._setpoint_in_force()
         self._jogged = False
         yield from write(
@@ -328,7 +328,9 @@ class DelixiModbus(DelixiParameters, table=HOLDING):
     def _goes_forward(self, direction: Direction | None) -> Script[bool]:
         yield from self._check_start()
         if direction is None and not (yield from self._is_at_rest()):
-            raise WriteForbidden(f"{self.name} turns, and cannot report which way: give the direction")
+            raise WriteForbidden(
+                f"{self.name} turns, but cannot report its direction: give a direction, forward or reverse"
+            )
         return direction is not Direction.REVERSE
 
     @verb
@@ -480,8 +482,8 @@ class DelixiNative(DelixiParameters, table=PARAMETER):
             raise self._reset_first(status.name)
         if status not in CONDITIONS:
             raise WriteForbidden(
-                f"{self.name} reports {int(status):04X}H in reply to K = 03, "
-                "a state that the manual does not explain"
+                f"{self.name} reports state {int(status):04X}H in its reply to K = 03, "
+                "which the manual does not explain"
             )
         yield from self._setpoint_in_force()
         if direction is None and status == DelixiNativeStatus.REVERSE:

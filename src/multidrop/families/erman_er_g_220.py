@@ -141,7 +141,7 @@ class ErmanERG220(Drive):
     baudrates = (38400,)
     line_terminals = "485A and 485B"
     most_devices = 31  # section 1
-    remote = "b.001 must be 2 and b.002 5 (RS-485)"
+    remote = "b.001 must be 2 and b.002 must be 5 (RS-485)"
     line_parameters = (
         "b.010 address (1 from the factory), set while the motor stands, in effect after the next power-on; "
         "38400 bit/s and 1 stop bit are fixed, and there is no parity"
@@ -232,7 +232,7 @@ class ErmanERG220(Drive):
             yield from read(self.status)
         except DriveException as refusal:
             raise WriteForbidden(
-                f"{self.name} has no state register at 0400H: it is not an ER-G-220-01(02)"
+                f"{self.name} has no state register at 0400H, so it is not an ER-G-220-01(02)"
             ) from refusal
 
     @verb

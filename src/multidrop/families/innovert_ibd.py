@@ -266,8 +266,8 @@ class InnovertIBD(Drive):
             return
         if not (self._has_state and (yield from self._state_matches())):
             raise WriteForbidden(
-                f"{self.name} does not show its own baud rate at 02BCH and its address at 02BEH: look at its "
-                "name plate, and declare confirmed = 1 if it is an IBD",
+                f"{self.name} does not show its baud rate in 02BCH and its address in 02BEH, as an IBD does. "
+                "Check its name plate, and declare confirmed = 1 if the drive is an IBD",
                 advice=Advice.declare("confirmed", 1),
             )
 
@@ -329,7 +329,7 @@ class InnovertIBD(Drive):
         if word is IBDControl.RUN:
             yield from self._setpoint_in_force()
         if (yield from self._runs()):
-            raise self._stop_first(f"{self.name} turns, and no register shows whether it jogs")
+            raise self._stop_first(f"{self.name} already turns, and no register shows if this is a jog")
         yield from write(self.control, sent)
         yield from self._started(direction)
 
@@ -337,8 +337,8 @@ class InnovertIBD(Drive):
         forward = self.option.get("forward_bit")
         if forward not in (2, 3):
             raise WriteForbidden(
-                f"{self.name}: the manual is ambiguous about which bit of 2000H is {direction.value}; "
-                "start without a direction, or try which of bits 2 and 3 turns it forward, and "
+                f"{self.name}: the manual does not say whether bit 2 or 3 of 2000H means {direction.value}. "
+                "Start without a direction, or find out which of them turns the motor forward and "
                 "declare forward_bit = N",
                 advice=Advice.declare("forward_bit", "N"),
             )
@@ -348,7 +348,7 @@ class InnovertIBD(Drive):
         if (yield from read(self.frequency_source)) != FrequencySource.LINE or (
             yield from read(self.run_source)
         ) != IBDRunSource.LINE:
-            raise WriteForbidden(f"{self.name} does not take its commands from the line: {self.remote}")
+            raise WriteForbidden(f"{self.name} does not take commands from the line: {self.remote}")
 
     def _runs(self) -> Script[bool]:
         return (yield from super()._runs()) or not (yield from self._is_at_rest())

@@ -198,7 +198,7 @@ class InvtCHE(Drive):
     broadcasts = True
     identify_recognises = True
     setpoint_name = "setpoint"
-    remote = "P0.01 must be 2, and P0.03 take the frequency from the line"
+    remote = "P0.01 must be 2, and P0.03 must take the frequency from the line"
     line_parameters = (
         "PC.00 address (1 from the factory), PC.01 baud rate (0 to 5: 1200, 2400, 4800, 9600, 19200, 38400; "
         "3 from the factory), PC.02 format (0 to 5: 8N1, 8E1, 8O1, 8N2, 8E2, 8O2, all RTU; 0 from the "
@@ -287,9 +287,9 @@ class InvtCHE(Drive):
         series = OTHER_SERIES.get(int(device))
         known = f", a {series}" if series else ""
         if int(device) >> 8 == CHF:
-            known = ", a CHF100A: declare model invt-chf100a"
+            known = ", a CHF100A; declare model = invt-chf100a"
         raise WriteForbidden(
-            f"{self.name} reports device code {int(device):04X}H{known}; a CHE reports 0101H or 0102H",
+            f"{self.name} reports device code {int(device):04X}H{known}. A CHE reports 0101H or 0102H",
             rule=ANOTHER_FAMILY if series else "",
         )
 
@@ -324,7 +324,7 @@ class InvtCHE(Drive):
             raise self._reset_first(fault)
         if status not in STATES:
             raise WriteForbidden(
-                f"{self.name} has {int(status):04X}H at 1001H, a state that the manual does not explain"
+                f"{self.name} shows state {int(status):04X}H in 1001H, which the manual does not explain"
             )
         if direction is None:
             return status != CHEStatus.REVERSE
@@ -386,7 +386,8 @@ class InvtCHE(Drive):
         most = self.option.get("maximum_frequency")
         if most is None:
             raise WriteForbidden(
-                f"{self.name} takes its setpoint in percent of P0.04: declare maximum_frequency = HZ",
+                f"{self.name} takes its setpoint in percent of P0.04, the maximum frequency: "
+                "declare maximum_frequency = HZ",
                 advice=Advice.declare("maximum_frequency", "HZ"),
             )
         if not 0 <= hz <= most:

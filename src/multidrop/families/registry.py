@@ -132,9 +132,9 @@ def _drive(module: ModuleType, path: str, name: str) -> type[Drive]:
         for key, value in vars(module).items()
         if isinstance(value, type) and issubclass(value, Drive) and value.registers
     ]
-    choices = f"write {' or '.join(drives)}" if drives else "it declares no drive"
+    choices = f"write {' or '.join(drives)}" if drives else "the file declares no drive class"
     if not name:
-        raise ValueError(f"{path} names no class; {choices}")
+        raise ValueError(f"{path} needs the name of a class after a colon; {choices}")
     if found is None:
         raise ValueError(f"{path} has no class {name!r}; {choices}")
     raise ValueError(f"{path}:{name} is not a subclass of multidrop.Drive with registers; {choices}")
@@ -144,7 +144,7 @@ def _load(path: Path) -> ModuleType:
     try:
         is_there = path.is_file()
     except OSError as failure:
-        raise ValueError(f"no model can be read from {path}: {failure.strerror}") from failure
+        raise ValueError(f"the model file {path} cannot be read: {failure.strerror}") from failure
     if not is_there:
         raise ValueError(f"the model file {path} does not exist")
     return load_model_file(path)

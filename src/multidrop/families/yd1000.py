@@ -383,14 +383,14 @@ class YD1000(Drive):
         address = yield from read(self.address_setting)
         if address != self.address:
             raise WriteForbidden(
-                f"{self.name} has {address:g} at 0802H (F802), not its address {self.address}: it may be "
-                "another make; look at its name plate"
+                f"{self.name} shows address {address:g} in 0802H (F802), but is declared at address "
+                f"{self.address}. The device may be from another maker: check its name plate"
             )
         most = yield from read(self.maximum_frequency)
         if not 30 <= most <= 320:
             raise WriteForbidden(
-                f"{self.name} has {most:g} Hz at 0011H (FH), not 30 to 320: it may be another make; look at "
-                "its name plate"
+                f"{self.name} shows a maximum frequency of {most:g} Hz in 0011H, which is outside 30 to 320 "
+                "Hz. The device may be from another maker: check its name plate"
             )
 
     @verb
@@ -419,15 +419,15 @@ class YD1000(Drive):
         hz = yield from read(self.registers[f"preset_speed_{number}"])
         if hz == 0:
             raise WriteForbidden(
-                f"preset speed {number} of {self.name} is 0: set preset_speed_{number} first"
+                f"preset speed {number} of {self.name} is 0: write preset_speed_{number} first"
             )
         if (yield from self._without_fault()).condition is Condition.RUNNING:
             raise self._stop_first(f"{self.name} turns, and a preset speed is started only from rest")
         yield from insist(self.control, STOP)
         if (yield from read(self.reference_frequency)) == hz:
             raise WriteForbidden(
-                f"{self.name} is not started: its frequency command is already {hz:g} Hz, so the selection "
-                f"of preset speed {number} could not be verified; write another frequency to 1001H first"
+                f"{self.name} is not started: its frequency command is already {hz:g} Hz, so preset speed "
+                f"{number} cannot be verified. Write another frequency to 1001H first"
             )
         bits = YD1000Control(0)
         for at, bit in enumerate(PRESET_SPEEDS):
@@ -521,7 +521,7 @@ class YD1000(Drive):
         """
         if (yield from read(self.output_frequency)) > 0:
             raise WriteForbidden(f"{self.name} runs: it has no fault to reset")
-        yield from self._no_terminal_runs("once a reset has restarted the drive")
+        yield from self._no_terminal_runs("after the reset")
         with suppress(Unconfirmed):  # the restart may cut off the reply
             yield from write(self.control, STOP | YD1000Control.RESET)
         yield from wait(RESET_TIME)
@@ -538,8 +538,8 @@ class YD1000(Drive):
         for what, function in functions.items():
             if (yield from read(function)) in RUN_FUNCTIONS:
                 raise WriteForbidden(
-                    f"{what} of {self.name} is set to run, and may start the motor {when}: change that "
-                    f"function, or open that terminal, first"
+                    f"{what} of {self.name} has a run function and may start the motor {when}. First change "
+                    f"this function or open the terminal"
                 )
 
     @verb
@@ -549,8 +549,8 @@ class YD1000(Drive):
         If the motor is then seen to turn, or the drive does not answer, the stop is written again.
         """
         if not (yield from self._is_at_rest()):
-            raise self._stop_first(f"the motor of {self.name} turns")
-        yield from self._no_terminal_runs("once the line no longer commands it")
+            raise self._stop_first(f"control of {self.name} is released only at rest, but its motor turns")
+        yield from self._no_terminal_runs("when the line releases control")
         try:
             yield from write(self.control, YD1000Control(0))
         except Unconfirmed:  # the write may have taken effect
@@ -575,7 +575,7 @@ class YD1000(Drive):
         for name in ("preset_speed", "setpoint_by_fnod"):
             if self.option.get(name):
                 raise WriteForbidden(
-                    f"{self.name} takes no setpoint from 1001H: its option {name} selects another source"
+                    f"{self.name} ignores the setpoint 1001H: its option {name} selects another source"
                 )
         yield from self._write_setpoint(self.frequency, hz)
 

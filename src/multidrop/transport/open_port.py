@@ -144,7 +144,7 @@ def unopened(port: str) -> serial.Serial:
     scheme, is_url, rest = port.partition("://")
     known = SCHEMES if "?" in rest else (*SCHEMES, *_FOR_PROGRAMS)
     if is_url and scheme.lower() not in known:
-        raise NoSuchPort(port, f"there is no {scheme}://; a URL is such as {URLS}")
+        raise NoSuchPort(port, f"the scheme {scheme}:// is not supported; write a URL such as {URLS}")
     if not is_url and _HOST_AND_PORT.fullmatch(port) and not Path(port).exists():
         raise NoSuchPort(port, f"for Modbus TCP write tcp://{port}, for RTU over TCP socket://{port}")
     if url.scheme == "rfc2217":

@@ -148,7 +148,7 @@ def test_a_family_file_may_allow_drive_addresses_0_to_255(tmp_path: Path) -> Non
     assert loaded.addresses == range(256)
     for unit in (0, 248, 255):
         loaded(unit).take_framing_of("tcp://10.0.0.7")
-        with pytest.raises(ValueError, match=rf"address {unit} is a unit id of Modbus TCP; on /dev/ttyUSB0"):
+        with pytest.raises(ValueError, match=rf"address {unit} is valid only on Modbus TCP; on /dev/ttyUSB0"):
             loaded(unit).take_framing_of("/dev/ttyUSB0")
     assert any("addresses = [0, 256]" in one for one in mistakes(tmp_path, head.replace("255", "256")))
 
@@ -481,9 +481,9 @@ def test_family_file_can_declare_text_registers(tmp_path: Path) -> None:
     ("entry", "expected"),
     [
         ("a = { at = 1 }", "[text] a: 'length' is missing; add length = 8"),
-        ("a = { at = 1, length = 126 }", "a text has 126 registers; it must have 1 to 125"),
+        ("a = { at = 1, length = 126 }", "length = 126 of a text is not 1 to 125 registers"),
         ("a = { at = 1, length = 2, order = 'CDAB' }", "a text has order = 'CDAB'"),
-        ("a = { at = '00001', length = 2 }", "a text has the table 'coil'; it must be in"),
+        ("a = { at = '00001', length = 2 }", "a text has the table 'coil'; a text must be in"),
         ("a = { at = 1, length = 2 }\n[reading]\na = { at = 1 }", "a register has this name too"),
         (
             "name = { at = 1, length = 2 }",

@@ -209,7 +209,7 @@ def test_direction_of_a_start_is_sent_or_refused(line: Line, model: str) -> None
     assert line.drive.state().condition is Condition.RUNNING
     assert line.sim.motor.frequency == pytest.approx(-20, abs=0.01)
     if model in ("danfoss-fc51", "schneider-atv320"):  # the status of these drives shows no direction
-        with pytest.raises(WriteForbidden, match="cannot report which way"):
+        with pytest.raises(WriteForbidden, match="cannot report its direction"):
             line.drive.start()
     else:
         line.drive.start()  # without a direction, the drive keeps its present direction
@@ -322,7 +322,7 @@ def test_a_profidrive_start_during_off2_or_off3_is_refused(name: str) -> None:
     line = Line("abb-acs355")
     line.drive.set_frequency(20)
     setattr(line.sim, name, True)
-    with pytest.raises(WriteForbidden, match=f"{name.upper()}.* is active from elsewhere"):
+    with pytest.raises(WriteForbidden, match=f"another source holds {name.upper()} .* active"):
         line.drive.start()
     assert line.starts == []
     setattr(line.sim, name, False)
@@ -342,7 +342,7 @@ def test_a_reset_of_a_locked_trip_is_refused_until_a_power_cycle() -> None:
     line = Line("danfoss-fc51")
     line.sim.trip(FAULT)
     line.sim.is_locked = True
-    with pytest.raises(WriteForbidden, match="take its mains away"):
+    with pytest.raises(WriteForbidden, match="switch off its mains"):
         line.drive.reset_fault()
     assert line.writes == []
     line.sim.power_cycle()

@@ -169,26 +169,26 @@ def test_identity_check_accepts_a_drive_of_the_family(model: str) -> None:
 
 
 STRANGERS: list[tuple[str, dict[str, Any], str]] = [
-    ("abb-acs355", {"status": 0x0241}, "switched on and inhibited"),
-    ("abb-acs355", {"status": 0x0202}, "ready to operate and not to be switched on"),
-    ("abb-acs355", {"station": 7}, "says that its address is 7"),
-    ("abb-acs355", {"signature": 1}, "signature is 1, and none of drv_lim, drv_full"),
-    ("danfoss-fc51", {"status": 0x0E08}, "run and be tripped"),
+    ("abb-acs355", {"status": 0x0241}, "both ready to switch on and inhibited"),
+    ("abb-acs355", {"status": 0x0202}, "ready to operate but not to switch on"),
+    ("abb-acs355", {"station": 7}, "reports address 7"),
+    ("abb-acs355", {"signature": 1}, "signature is 1, not one of drv_lim, drv_full"),
+    ("danfoss-fc51", {"status": 0x0E08}, "both running and tripped"),
     ("danfoss-fc51", {"signature": 0}, "signature"),
     ("delta-vfd-el", {"status": 0xA000}, "bits 15 to 13 are none of its modes"),
-    ("delta-vfd-el", {"station": 12}, "address is 12"),
+    ("delta-vfd-el", {"station": 12}, "reports address 12"),
     ("invt-goodrive", {"status": 0}, "no such number"),
     ("invt-goodrive", {"device": 0}, "device is 0"),
     ("powtran-pi130", {"status": 0}, "no such number"),
     ("powtran-pi130", {"fault": 100}, "fault is 100"),
-    ("delixi-e", {"station": 4}, "address is 4"),
+    ("delixi-e", {"station": 4}, "reports address 4"),
     ("siemens-v20", {"base_frequency": 0}, "base_frequency is 0"),
     ("yaskawa-a1000", {"status": 0}, "no bit is set"),
-    ("yaskawa-a1000", {"status": 0xC083}, "run and have a fault"),
-    ("yaskawa-a1000", {"signature": 0x5630}, "none of a1000"),
+    ("yaskawa-a1000", {"status": 0xC083}, "both running and in a fault"),
+    ("yaskawa-a1000", {"signature": 0x5630}, "not one of a1000"),
     ("optidrive-e3", {"status": 0x0080}, "reserved bits"),
-    ("optidrive-e3", {"signature": 0}, "none of modbus, modbus_and_ramp"),
-    ("schneider-atv320", {"status": 0x0202}, "none of the states"),
+    ("optidrive-e3", {"signature": 0}, "not one of modbus, modbus_and_ramp"),
+    ("schneider-atv320", {"status": 0x0202}, "not a state of CiA 402"),
 ]
 
 
@@ -378,8 +378,8 @@ def test_a_jog_of_a_turning_motor_is_refused(model: str, status: Any) -> None:
 
 
 HINDRANCES = [
-    ("abb-acs355", 0x0060 | 0x0200, "OFF2, which coasts, is active from elsewhere"),
-    ("abb-acs355", 0x0050 | 0x0200, "OFF3, the quick stop, is active from elsewhere"),
+    ("abb-acs355", 0x0060 | 0x0200, "another source holds OFF2 \\(coast\\) active"),
+    ("abb-acs355", 0x0050 | 0x0200, "another source holds OFF3 \\(quick stop\\) active"),
     ("abb-acs355", 0x0070 | 0x0200, "switching on is inhibited"),
     ("abb-acs355", 0x0030 | 0x0200, "not ready to be switched on"),
     ("danfoss-fc51", 0x0600, "is not ready"),
@@ -387,7 +387,7 @@ HINDRANCES = [
     ("optidrive-e3", 0x0000, "is not ready to run"),
     ("optidrive-e3", 0x0100, "is not ready to run"),  # status of a running motor, with swapped bytes
     ("invt-goodrive", 5, "has no mains"),
-    ("yaskawa-a1000", 0x4022, "does not take its commands from the line"),
+    ("yaskawa-a1000", 0x4022, "does not take commands from the line"),
     ("yaskawa-a1000", 0x8002, "is not ready"),
 ]
 
@@ -452,13 +452,13 @@ def test_the_condition_is_decoded_from_the_status_word(
 def test_motor_that_runs_at_0_hz_is_not_reported_as_stopped(model: str, running: int) -> None:
     found = wire(model, running, output_frequency=0.0)
     found.drive.option["stop_time"] = 5.0
-    with pytest.raises(Unconfirmed, match="5 s it is not seen to have stopped"):
+    with pytest.raises(Unconfirmed, match="does not report a stop within 5 s"):
         found.drive.stop()
 
 
 @pytest.mark.parametrize(
     ("shown", "sentence"),
-    [(0.0, "setpoint .* is 0"), (12.5, r"follows 12\.50 Hz, not the setpoint that was written")],
+    [(0.0, "setpoint .* is 0"), (12.5, r"follows 12\.50 Hz instead of the written setpoint")],
 )
 def test_a_delta_start_is_refused_if_another_setpoint_is_shown(shown: float, sentence: str) -> None:
     found = wire("delta-vfd-el", DELTA_STOP, reference_in_force=shown)

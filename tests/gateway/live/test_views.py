@@ -486,5 +486,5 @@ def test_reading_parameters_is_refused_for_a_family_without_known_addresses(tmp_
     with served(tmp_path) as gateway:
         gateway.get(f"{PARAMETERS}?read=1")
         until(lambda: parameter_state(gateway) == "failed")
-        assert "no reliable rule" in gateway.get(PARAMETERS).json["error"]
+        assert "addresses of parameters are not known" in gateway.get(PARAMETERS).json["error"]
         assert gateway.get("/api/parameters/nobody").status == 404

@@ -94,7 +94,7 @@ class CiA402(Profile):
         if status & SHORT_MASK in (NOT_READY, SWITCH_ON_DISABLED, FAULT_REACTION, FAULT):
             return ""
         known = status & MASK in (READY, SWITCHED_ON, ENABLED, QUICK_STOP)
-        return "" if known else "it is none of the states of CiA 402"
+        return "" if known else "this is not a state of CiA 402"
 
     def _is_tripped(self, status: int) -> bool:
         return bool(status & CiA402Status.FAULT)
@@ -106,17 +106,19 @@ class CiA402(Profile):
         return Condition.DECELERATING if status & MASK == QUICK_STOP else super()._condition(status)
 
     def _not_ready(self, status: int) -> str:
-        return "" if status & CiA402Status.REMOTE else "does not take its commands from the line"
+        return "" if status & CiA402Status.REMOTE else "does not take commands from the line"
 
     def _start_word(self, direction: Direction | None, status: int) -> int:
         reverse = {member.name: int(member) for member in self.control.values or ()}.get("REVERSE", 0)
         if direction is not None and not reverse:
             raise WriteForbidden(
-                f"{self.name}: the standard defines no direction, and the family declares no direction bit; "
+                f"the control word of {self.name} has no declared bit for the direction: "
                 "start without a direction"
             )
         if direction is None and reverse and self._turns(status):
-            raise WriteForbidden(f"{self.name} turns, and cannot report which way: give the direction")
+            raise WriteForbidden(
+                f"{self.name} turns, but cannot report its direction: give a direction, forward or reverse"
+            )
         return ENABLE | reverse if direction is Direction.REVERSE else ENABLE
 
     def _prepare(self, status: int) -> Script[None]:
@@ -206,9 +208,9 @@ class Profidrive(Profile):
     def _impossible(self, status: int) -> str:
         inhibited = status & ProfidriveStatus.SWITCH_ON_INHIBITED
         if inhibited and status & (ProfidriveStatus.READY_TO_OPERATE | ProfidriveStatus.READY_TO_SWITCH_ON):
-            return "it would be ready to be switched on and inhibited from it"
+            return "this would be both ready to switch on and inhibited"
         if status & ProfidriveStatus.READY_TO_OPERATE and not status & ProfidriveStatus.READY_TO_SWITCH_ON:
-            return "it would be ready to operate and not to be switched on"
+            return "this would be ready to operate but not to switch on"
         return ""
 
     def _is_tripped(self, status: int) -> bool:
@@ -228,8 +230,8 @@ class Profidrive(Profile):
     def _start_word(self, direction: Direction | None, status: int) -> int:
         if direction is not None:
             raise WriteForbidden(
-                f"{self.name}: this profile has no bit for the direction, which depends on the reference's "
-                f"sign or the drive's settings; start without a direction"
+                f"the control word of {self.name} has no bit for the direction: start without a direction. "
+                "The sign of the reference or the drive's settings select it"
             )
         return START
 
@@ -242,7 +244,7 @@ class Profidrive(Profile):
         yield from write(self.control, self._word(ON))
         if not (yield from until(self._is_on, limit=READY_TIME)):
             yield from insist(self.control, self._word(self.stop_word))
-            why = f"after {READY_TIME:g} s it is not ready to operate"
+            why = f"the drive is not ready to operate after {READY_TIME:g} s"
             raise NotVerified(self.name, "the start", f"{why}; {self.remote}")
 
     def _is_ready(self) -> Script[bool]:
@@ -256,12 +258,12 @@ class Profidrive(Profile):
     def _hindrance(self, status: int) -> str:
         """Return the most serious reason why the drive cannot be switched on, as text."""
         if not status & ProfidriveStatus.NO_OFF2:
-            return "OFF2, which coasts, is active from elsewhere"
+            return "another source holds OFF2 (coast) active"
         if not status & ProfidriveStatus.NO_OFF3:
-            return "OFF3, the quick stop, is active from elsewhere"
+            return "another source holds OFF3 (quick stop) active"
         if status & ProfidriveStatus.SWITCH_ON_INHIBITED:
             return "switching on is inhibited"
-        return "it is not ready to be switched on"
+        return "the drive is not ready to be switched on"
 
 
 # ---- Danfoss FC ----
@@ -331,7 +333,7 @@ class DanfossFC(Profile):
 
     def _impossible(self, status: int) -> str:
         if status & DanfossStatus.RUNNING and status & DanfossStatus.TRIPPED:
-            return "it would run and be tripped"
+            return "this would be both running and tripped"
         return ""
 
     def _is_tripped(self, status: int) -> bool:
@@ -349,12 +351,14 @@ class DanfossFC(Profile):
 
     def _cannot_reset(self, status: int) -> str:
         if status & DanfossStatus.TRIP_LOCKED:
-            return "is trip-locked, which no reset ends: take its mains away, and see to the cause"
+            return "is trip-locked, which a reset cannot clear; switch off its mains and remove the cause"
         return ""
 
     def _start_word(self, direction: Direction | None, status: int) -> int:
         if direction is None and self._turns(status):
-            raise WriteForbidden(f"{self.name} turns, and cannot report which way: give the direction")
+            raise WriteForbidden(
+                f"{self.name} turns, but cannot report its direction: give a direction, forward or reverse"
+            )
         return self.start_word | (DanfossControl.REVERSE if direction is Direction.REVERSE else 0)
 
 
@@ -442,7 +446,7 @@ class Optidrive(Profile):
     def _start_word(self, direction: Direction | None, status: int) -> int:
         if direction is not None:
             raise WriteForbidden(
-                f"{self.name}: its control word has no bit for the direction; start without a direction"
+                f"the control word of {self.name} has no bit for the direction: start without a direction"
             )
         return self.start_word
 
@@ -510,7 +514,7 @@ class Yaskawa(Profile):
 
     def _impossible(self, status: int) -> str:
         if status & YaskawaStatus.RUNS and status & YaskawaStatus.FAULT:
-            return "it would run and have a fault"
+            return "this would be both running and in a fault"
         return "" if status else "no bit is set"
 
     def _is_tripped(self, status: int) -> bool:
@@ -521,7 +525,7 @@ class Yaskawa(Profile):
 
     def _not_ready(self, status: int) -> str:
         if not status & YaskawaStatus.COMMANDED_BY_LINE:
-            return "does not take its commands from the line"
+            return "does not take commands from the line"
         return "" if status & (YaskawaStatus.READY | YaskawaStatus.RUNS) else "is not ready"
 
     def _direction(self, status: int) -> Direction | None:

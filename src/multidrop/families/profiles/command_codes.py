@@ -114,7 +114,7 @@ class Delta(Profile):
         return Condition.DECELERATING if status & 3 == STOPPING else super()._condition(status)
 
     def _not_ready(self, status: int) -> str:
-        return "" if status & DeltaStatus.COMMANDED_BY_LINE else "does not take its commands from the line"
+        return "" if status & DeltaStatus.COMMANDED_BY_LINE else "does not take commands from the line"
 
     def _direction(self, status: int) -> Direction | None:
         shown = status >> 3 & 3

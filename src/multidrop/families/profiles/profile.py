@@ -351,7 +351,7 @@ class Profile(Drive):
         if held == 0:
             problem = f"the setpoint of {self.name} is 0:"
         elif held != self.commanded and not self.reference.readable:
-            problem = f"{self.name} follows {shown.format(held)}, not the setpoint that was written;"
+            problem = f"{self.name} follows {shown.format(held)} instead of the written setpoint:"
         else:
             return
         way = Advice.call("set_frequency")
@@ -371,14 +371,14 @@ class Profile(Drive):
             wrong.append(f"its status is {status:04X}H, and {impossible}")
         station = self.registers.get("station")
         if station is not None and (address := int((yield from read(station)))) != self.address:
-            wrong.append(f"it says that its address is {address}")
+            wrong.append(f"it reports address {address}")
         signature = self.registers.get("signature")
         if signature is not None:
             assert signature.values is not None
             held = yield from read(signature)
             if not isinstance(held, signature.values):
                 names = ", ".join(value.name for value in signature.values)
-                wrong.append(f"{signature.name} is {held:g}, and none of {names}")
+                wrong.append(f"{signature.name} is {held:g}, not one of {names}")
         for proof in self.identity_proofs:
             register = self.register(proof.register)
             value = yield from read(register)
@@ -413,7 +413,7 @@ class Profile(Drive):
                 f"{self.name} cannot be started: its status is {status:04X}H, and {impossible}"
             )
         if why := self._not_ready(status):
-            raise WriteForbidden(f"{self.name} is not started: it {why}; {self.remote}")
+            raise WriteForbidden(f"{self.name} is not started: the drive {why}; {self.remote}")
 
     def _jog_word(self, direction: Direction | None, forward: int, reverse: int) -> Script[Any]:
         """Return the control word of a jog. Raises WriteForbidden as `start` does, and if the motor turns."""
@@ -467,7 +467,7 @@ class Profile(Drive):
                 raise WriteForbidden(f"{self.name} runs: it has no fault to reset")
             return
         if why := self._cannot_reset(status):
-            raise WriteForbidden(f"{self.name} is not reset: it {why}")
+            raise WriteForbidden(f"{self.name} is not reset: the drive {why}")
         yield from insist(self.control, self._word(self.stop_word))  # ends a run that was commanded earlier
         yield from self._pulse()
         if not (yield from until(self._is_reset, limit=RESET_TIME)):
