@@ -147,6 +147,7 @@ struct md_before {
 struct md_turn {
     int source, last;     /* enum md_source: of the exchange in flight, and of the previous one */
     int is_ending;        /* 1: start no more polled exchanges */
+    int was_silent;       /* 1: the latest exchange's drive did not answer */
     int has_done_urgent;  /* an urgent exchange ended; the engine resets this flag */
     struct md_urgent *urgent;
     const struct md_exchange *const *round; /* the repeated exchanges */

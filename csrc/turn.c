@@ -190,12 +190,20 @@ static int is_overtaken(const struct md_turn *turn)
     return exchange->stops && md_load(exchange->stops) != exchange->stops_seen;
 }
 
-/* Move the first request that may be sent now to the front and return it; otherwise set wake_ns. While a stop
- * waits for its drive, send only other stops: the stop must not wait for further exchanges. */
-static struct md_urgent *find_urgent(struct md_turn *turn, int *is_held, int64_t *wake_ns, int64_t now_ns)
+static int is_silent(const struct md_exchange *exchange)
+{
+    return __atomic_load_n(&exchange->drive->failures, __ATOMIC_RELAXED) > 0;
+}
+
+/* Move the first of these requests that may be sent now to the front and return it; otherwise set wake_ns.
+ * While a stop waits for its drive, send only other stops: the stop must not wait for further exchanges. */
+static struct md_urgent *find_among(struct md_turn *turn, int only_answering, int *is_held, int64_t *wake_ns,
+                                    int64_t now_ns)
 {
     for (struct md_urgent **at = &turn->urgent; *at; at = &(*at)->next) {
         struct md_urgent *urgent = *at;
+        if (only_answering && (!urgent->exchange->insists || is_silent(urgent->exchange)))
+            continue;
         if (*is_held && !urgent->exchange->insists)
             return NULL;
         if (is_time(later(urgent->not_before_ns, ready_ns(urgent->exchange)), wake_ns, now_ns)) {
@@ -207,6 +215,16 @@ static struct md_urgent *find_urgent(struct md_turn *turn, int *is_held, int64_t
         *is_held |= urgent->exchange->insists;
     }
     return NULL;
+}
+
+/* Find the next request as find_among() does. After an exchange with a silent drive, stops of drives that
+ * answer go first: they would otherwise wait for the timeouts of all silent drives that are being stopped. */
+static struct md_urgent *find_urgent(struct md_turn *turn, int *is_held, int64_t *wake_ns, int64_t now_ns)
+{
+    struct md_urgent *urgent = NULL;
+    if (turn->was_silent)
+        urgent = find_among(turn, 1, is_held, wake_ns, now_ns);
+    return urgent ? urgent : find_among(turn, 0, is_held, wake_ns, now_ns);
 }
 
 /* ---- polling ---- */
@@ -334,6 +352,7 @@ static void finish(struct md_turn *turn)
 {
     int source = turn->source;
     turn->last = source;
+    turn->was_silent = is_silent(turn->line.exchange);
     turn->source = MD_NO_SOURCE;
     if (turn->progress.echo != (uint32_t)turn->line.echo)
         md_store(&turn->progress.echo, (uint32_t)turn->line.echo);
