@@ -198,7 +198,7 @@ def _request(method: Method) -> Method:
 
 def _unsupported(function: int) -> Callable[..., Awaitable[Any]]:
     async def refuse(unit: ModbusUnit, *arguments: Any, **named: Any) -> Any:
-        raise NotImplementedError(f"multidrop does not send function {function:02X}H: {OTHER}")
+        raise NotImplementedError(f"multidrop does not send Modbus function {function:02X}H: {OTHER}")
 
     return refuse
 
@@ -292,7 +292,9 @@ class ModbusUnit:
     @_request
     async def diagnostics(self, sub_function: int, data: int = 0) -> int:
         if sub_function not in (0, *COUNTERS):
-            raise NotImplementedError(f"multidrop does not send diagnostics {sub_function:02X}H: {OTHER}")
+            raise NotImplementedError(
+                f"multidrop does not send diagnostics sub-function {sub_function:02X}H: {OTHER}"
+            )
         return int.from_bytes(await self._send(8, sub_function, data.to_bytes(2)))
 
     @_request

@@ -200,8 +200,8 @@ class ModbusDevice(Drive):
             raise ValueError(f"one write takes 1 to {most} registers or coils, not {count}")
         if confirm is not True:
             raise WriteForbidden(
-                f"nothing is written to {what} of {self.name}: this device is unknown, and a write may start "
-                f"a motor. If it cannot, {_CONFIRM}",
+                f"nothing is written to {what} of the unknown device {self.name}, because a write may start "
+                f"a motor. If this write cannot start a motor, {_CONFIRM}",
                 rule="an unknown device is not written to",
                 advice=Advice(_CONFIRM, "declare its family"),
             )
@@ -249,9 +249,9 @@ def _raw(value: float, format: str, coding: Coding) -> float:
         raise ValueError(f"{value!r} is not a finite number")
     least, most = coding.raw_span
     if not least <= Fraction(value) <= most:
-        raise ValueError(f"{value:g} does not fit into {format}: {float(least):g} to {float(most):g}")
+        raise ValueError(f"{value:g} does not fit into {format}; write {float(least):g} to {float(most):g}")
     if coding.number_format not in FLOATS and value != int(value):
-        raise ValueError(f"{value:g} is not a whole number, as {format} needs")
+        raise ValueError(f"the format {format} needs a whole number, not {value:g}")
     return coding.count_of(value)
 
 

@@ -120,7 +120,7 @@ class Supervisor:
         """Note and log that a permanent task or thread has ended."""
         self.dead[name] = why
         self.has_dead.set()
-        _log.error("%s has ended, and does not come back: %s", name, why, exc_info=failure)
+        _log.error("%s has ended and is not restarted: %s", name, why, exc_info=failure)
 
     def check(self) -> None:
         """Raise Ended if a permanent task or thread is known to have ended."""

@@ -35,7 +35,7 @@ def read_document(path: Path, what: str) -> dict[str, Any]:
     """
     try:
         if path.is_char_device():
-            raise DocumentError(f"this is a device, not a {what}")
+            raise DocumentError(f"the path is a device, not a {what}")
         data = path.read_bytes()
     except OSError as failure:
         raise DocumentError(f"the {what} cannot be read: {failure.strerror}") from failure

@@ -172,8 +172,8 @@ def test_an_unknown_device_on_modbus_tcp_is_listed_once_without_a_baud_rate(run:
         (("--addresses", "1-99999999999"), "invalid addresses '1-99999999999': write 1 to 247"),
         (("--addresses", "one"), "invalid addresses 'one': write 1 to 247"),
         (("--baudrates", "fast"), "invalid baud rates 'fast': write numbers, such as 9600,19200"),
-        (("--baudrates", "300"), "none of these families has baud rate 300"),
-        (("--formats", "9N1"), "none of these families has format 9N1"),
+        (("--baudrates", "300"), "none of these families allows baud rate 300"),
+        (("--formats", "9N1"), "none of these families allows format 9N1"),
         (("--model", "inovert-ibd"), "did you mean innovert-ibd"),
     ],
 )

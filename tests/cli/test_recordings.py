@@ -67,7 +67,8 @@ def test_series_without_values_are_not_plotted(run: Run, tmp_path: Path) -> None
     assert run("plot", path, "--drive", "pump") == (
         2,
         "",
-        "multidrop: there is no value to draw, only misses: no reply 3; `multidrop report` shows more\n",
+        "multidrop: there is no value to draw, only failed reads: no reply 3; "
+        "`multidrop report` shows more\n",
     )
     assert run("plot", path)[0] == 0
 

@@ -67,7 +67,7 @@ def test_modbus_device_refuses_writes_without_the_argument_confirm(meter: BusAnd
         lambda: device.write_coils(3, [True]),
         lambda: device.write_holding(5, [1], confirm=1),  # type: ignore[arg-type]
     ):
-        with pytest.raises(WriteForbidden, match="If it cannot, pass confirm=True"):
+        with pytest.raises(WriteForbidden, match="If this write cannot start a motor, pass confirm=True"):
             write()
     assert line.frames == []
 
@@ -156,8 +156,8 @@ def test_a_write_raises_an_error_if_another_number_is_read_back(
 @pytest.mark.parametrize(
     ("values", "format", "sentence"),
     [
-        ([-1], "U16", "-1 does not fit into U16: 0 to 65535"),
-        ([1.5], "I16", "1.5 is not a whole number"),
+        ([-1], "U16", "-1 does not fit into U16; write 0 to 65535"),
+        ([1.5], "I16", "I16 needs a whole number, not 1.5"),
         ([float("nan")], "F32", "nan is not a finite number"),
         ([0] * 124, "U16", "one write takes 1 to 123 registers or coils, not 124"),
         ([], "U16", "not 0"),

@@ -134,7 +134,7 @@ def test_a_killed_task_ends_the_gateway(gateway: Any, name: str, caplog: pytest.
 
     with pytest.raises(Ended, match=f"{name} has ended: it was cancelled"):
         gateway(kill)
-    assert f"{name} has ended, and does not come back: it was cancelled" in caplog.text
+    assert f"{name} has ended and is not restarted: it was cancelled" in caplog.text
 
 
 def test_the_exception_that_ended_a_task_is_logged_with_its_cause(

@@ -377,7 +377,7 @@ def test_the_page_cannot_stop_the_fleet_without_a_commanders_key_or_servers(tmp_
         assert gateway.get("/api/plant").json["fleet_stop"] is False
         answer = gateway.post("/api/fleet/stop", {})
         assert answer.status == 404
-        assert "add commander to [serve.fleet]" in answer.json["error"]
+        assert "add key 'commander' to [serve.fleet]" in answer.json["error"]
     path: Any = ServerPath([])
     nobody: Any = object
     part = FleetPart(path, FleetWatch(Looks(path)), nobody)

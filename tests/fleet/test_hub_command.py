@@ -346,7 +346,7 @@ def test_reading_files_during_a_merge_fails_or_gives_all_rows_once(sink: Parquet
                 told.append((at, str(error)))
             else:
                 assert len(rows) == len(set(rows)) == FILES * EXCHANGES * 10
-    sentence = "files were merged while they were read: read them again"
+    sentence = "files were merged during this read: read the history again"
     assert [at for at, _ in told] == [1, 5]
     assert all(text.endswith(sentence) for _, text in told)
 

@@ -287,9 +287,9 @@ def test_waiting_for_an_answer_that_arrives_byte_by_byte_has_a_limit(monkeypatch
     [
         ("hooks.example/T0K3N", "is not a URL"),
         ("https://", "is not a URL"),
-        ("https:///T0K3N", "a webhook is"),
-        ("https://[T0K3N/x", "a webhook is"),
-        ("https://anna:T0K3N@hooks.example/", "a webhook is"),
+        ("https:///T0K3N", "the webhook is not of the form"),
+        ("https://[T0K3N/x", "the webhook is not of the form"),
+        ("https://anna:T0K3N@hooks.example/", "the webhook is not of the form"),
         ("", "has no target"),
         ("# https://hooks.example/T0K3N", "has no target"),
     ],

@@ -313,7 +313,7 @@ def test_a_reload_needs_the_right_to_write_and_a_confirmation(tmp_path: Path) ->
         unconfirmed = gateway.post("/api/reload", {}, **gateway.writer)
         assert unconfirmed.status == 400
         assert unconfirmed.json == {
-            "error": 'a reload changes what is polled: confirm it with {"confirm": true}'
+            "error": 'a reload can change the polled drives: confirm it with {"confirm": true} in the body'
         }
         assert gateway.gateway.revision == revision
 
@@ -331,7 +331,7 @@ def test_a_start_sent_before_a_reload_does_not_reach_a_new_drive_of_that_name(tm
         start = {"drive": "pump-1", "verb": "start", "options": {}, "seen": seen}
         told = gateway.post("/api/act", start, **gateway.writer).json
         assert told["text"].startswith(
-            f"pump-1.start was not sent: the plant file was reloaded after frame {seen}"
+            f"pump-1.start was not sent: the plant file was reloaded after the values seen (frame {seen})"
         )
         assert not any(sim.motor.goal for sim in gateway.sims.values())  # type: ignore[attr-defined]
 

@@ -247,7 +247,7 @@ def test_a_newly_made_token_is_shown_once(run: Run) -> None:
         ),
         (
             ("--new-token", "stop", "--for", "a b"),
-            "'a b' cannot name a token: use up to 64 letters, digits and . _ @ -, a letter or digit first",
+            "invalid owner 'a b': use up to 64 letters, digits and . _ @ -, a letter or digit first",
         ),
     ],
 )

@@ -265,7 +265,7 @@ def test_access_from_other_machines_needs_tokens_and_tls(
         return
     (only,) = mistakes(tmp_path, serve)
     assert only == (
-        f'[serve]: listen = "{address}" is open to other machines: that needs tokens, certificate and key, '
+        f'[serve]: listen = "{address}" is open to other machines. Add tokens, certificate and key, '
         "or behind_proxy = true; or listen on 127.0.0.1"
     )
 
@@ -393,7 +393,7 @@ def test_an_invalid_host_in_a_listen_address_is_reported(tmp_path: Path, host: s
 
 def test_a_certificate_without_its_private_key_is_reported(tmp_path: Path, certificates: Path) -> None:
     (only,) = mistakes(tmp_path, f'[serve]\ncertificate = "{certificates}/own.pem"\n')
-    assert only == "[serve]: certificate alone is not enough: give certificate and key"
+    assert only == "[serve]: certificate alone is not enough: give both keys, certificate and key"
 
 
 def test_a_folder_in_which_no_audit_log_can_be_written_is_reported(tmp_path: Path) -> None:

@@ -100,7 +100,7 @@ def test_a_stop_continues_whichever_task_is_killed(
     assert dead(gateway) == {}
     in_loop(gateway.loop, lambda found: found.kept[name].cancel())
     until(lambda: dead(gateway) == {name: "it was cancelled"})
-    assert f"{name} has ended, and does not come back: it was cancelled" in caplog.text
+    assert f"{name} has ended and is not restarted: it was cancelled" in caplog.text
     assert all(one["done"] for one in gateway.post("/api/stop").json.values())
 
 
@@ -259,7 +259,7 @@ def test_each_thread_and_task_of_all_parts_is_listed_and_reported_if_it_ends(
         killed = {"alarms", "notify", "opcua", *forwarders}
         until(lambda: dead(gateway) == dict.fromkeys(killed, "ZeroDivisionError: a bug"))
         for name in killed:
-            assert f"{name} has ended, and does not come back: ZeroDivisionError: a bug" in caplog.text
+            assert f"{name} has ended and is not restarted: ZeroDivisionError: a bug" in caplog.text
         newest = gateway.get("/health").json["newest_row"]
         until(lambda: gateway.get("/health").json["newest_row"] > newest)
 

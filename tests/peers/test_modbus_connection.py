@@ -192,9 +192,9 @@ def test_unsupported_functions_and_parameters_are_refused_in_one_sentence() -> N
     async def use(connection: Any, registers: Registers) -> None:
         unit = connection.for_unit(1)
         assert isinstance(unit, neutral.ModbusUnit)
-        with pytest.raises(NotImplementedError, match="multidrop does not send function 14H: use"):
+        with pytest.raises(NotImplementedError, match="multidrop does not send Modbus function 14H: use"):
             await unit.read_file_record(1, 0, 2)
-        with pytest.raises(NotImplementedError, match="does not send diagnostics 04H"):
+        with pytest.raises(NotImplementedError, match="does not send diagnostics sub-function 04H"):
             await unit.diagnostics(4)
         assert registers.requests == []
 

@@ -502,7 +502,7 @@ def test_a_family_file_given_as_plant_file_is_reported_in_one_sentence(tmp_path:
 
 def test_a_device_path_given_as_plant_file_is_not_read() -> None:
     """Reading a serial port would block, and take bytes from its line."""
-    with pytest.raises(PlantError, match=r": this is a device, not a plant file$"):
+    with pytest.raises(PlantError, match=r": the path is a device, not a plant file$"):
         load_plant(os.devnull)
 
 

@@ -55,7 +55,7 @@ def test_the_method_at_returns_the_rows_at_the_given_indices(places: list[int]) 
 
 
 def test_columns_of_the_wide_table_in_a_list_raise_type_error() -> None:
-    with pytest.raises(TypeError, match=r"wide takes names of columns as separate arguments, not \['"):
+    with pytest.raises(TypeError, match=r"wide takes column names as separate arguments, not \['"):
         example().wide(cast(Any, ["pump-1.speed"]))
 
 
@@ -112,7 +112,7 @@ def test_the_pandas_and_numpy_constructors_refuse_a_batch_with_advice(library: s
     """The constructors of pandas and NumPy ignore Arrow's interface, and would read a batch row by row."""
     taker = pytest.importorskip(library, reason=f"needs {library}")
     take = taker.DataFrame if library == "pandas" else taker.asarray
-    with pytest.raises(TypeError, match=r"use batch\.to_pandas\(\)"):
+    with pytest.raises(TypeError, match=r"Use batch\.to_pandas\(\)"):
         take(example())
     assert list(example()) == EXAMPLE
 

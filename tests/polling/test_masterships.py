@@ -342,7 +342,7 @@ def test_a_duplicate_or_unknown_line_name_raises_a_one_sentence_error(mastership
 def test_a_port_handled_by_pyserial_is_refused_and_changes_nothing(mastership: Mastership) -> None:
     hold(mastership)
     bridged = line("rfc2217://127.0.0.1:1", quick("fan", 1, None), name="yard")
-    with pytest.raises(NoSuchPort, match="needs a port that the core writes to itself"):
+    with pytest.raises(NoSuchPort, match="a port of this kind cannot be used with a mastership"):
         Poller(plant(bridged), mastership=mastership)
     with lines(None) as (_, (hall, _)), Poller(plant(hall), mastership=mastership) as poller:
         with pytest.raises(NoSuchPort):

@@ -461,7 +461,7 @@ def test_a_parquet_file_that_unpacks_to_gigabytes_is_refused(
     mistake = (
         "is damaged after row 0: the texts of column drive take more than 67108 bytes"
         if uses_dictionary
-        else "is not a recording: a group of its rows takes 6[0-9]{5} bytes unpacked; the limit is 536870"
+        else "is not a recording: one of its row groups has 6[0-9]{5} bytes unpacked; the limit is 536870"
     )
     with pytest.raises(ValueError, match=mistake):
         list(open_recording(path))

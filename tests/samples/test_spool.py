@@ -397,7 +397,7 @@ def test_a_spool_refuses_the_folder_of_another_gateway(folder: Path) -> None:
 def test_a_spool_refuses_a_folder_with_an_invalid_spool_json(folder: Path, text: str) -> None:
     folder.mkdir()
     (folder / "spool.json").write_text(text)
-    with pytest.raises(SpoolError, match=r"spool.json was damaged, or written by another version"):
+    with pytest.raises(SpoolError, match=r"spool.json is damaged, or from another version"):
         Spool(folder, GATEWAY)
 
 

@@ -489,8 +489,8 @@ def test_port_that_supports_no_setting_raises_line_error() -> None:
 @table(
     ("asked", "sentence"),
     [
-        ({"baudrates": [300]}, "none of these families has baud rate 300; they have 1200, 2400, "),
-        ({"formats": ["7N1"]}, "none of these families has format 7N1; they have 7E1, "),
+        ({"baudrates": [300]}, "none of these families allows baud rate 300; they allow 1200, 2400, "),
+        ({"formats": ["7N1"]}, "none of these families allows format 7N1; they allow 7E1, "),
         ({"addresses": [250]}, "no family allows any of these addresses"),
         (
             {"baudrates": [1200], "formats": ["7E1"], "addresses": [40]},

@@ -193,9 +193,7 @@ def test_overload_fault_code_of_every_family_is_valid(model: type[Drive]) -> Non
 
 
 def test_a_simulated_trip_is_refused_for_a_drive_without_a_motor() -> None:
-    with pytest.raises(
-        ValueError, match="flaky has no simulated motor, so it takes no trip and no drift: remove them"
-    ):
+    with pytest.raises(ValueError, match="flaky has no simulated motor: remove its keys `trip` and `drift`"):
         two_drives(trip=1.0)
 
 
@@ -249,7 +247,7 @@ def read(line: Line) -> bytes:
 
 
 def test_simulated_hang_ups_are_refused_for_a_pty_without_a_link() -> None:
-    with pytest.raises(ValueError, match=r"^line: a port that hangs up must be a link or a TCP port"):
+    with pytest.raises(ValueError, match=r"^line: with `hang_up`, the port must be a link or a TCP port"):
         FaultyWire([simulated(Toy(1))], Faults(hang_up=0.1))
 
 
@@ -275,7 +273,7 @@ def test_all_mistakes_in_a_faults_file_are_reported_together(tmp_path: Path) -> 
             (6, 'away = 3 is not right; write away = "1 s"'),
             (3, f"late = {soon.value}"),
             (1, "drop = 1.5 is not a rate; write one from 0 to 1, such as 0.01"),
-            (4, "burst = 0 is not from 1 to 4096 characters"),
+            (4, "burst = 0 is not a number of characters from 1 to 4096"),
         )
     ]
 

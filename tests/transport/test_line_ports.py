@@ -192,7 +192,7 @@ def test_an_rfc2217_port_is_polled(server: SerialServer) -> None:
 @pyserials_own
 def test_drives_with_different_settings_are_refused_on_an_rfc2217_port(server: SerialServer) -> None:
     slow, fast = Toy(1, baudrate=9600), Toy(2, baudrate=19200)
-    with pytest.raises(LineError, match=r"cannot switch its settings between two drives$"):
+    with pytest.raises(LineError, match=r"cannot change its baud rate or format between drives$"):
         Poller(plant(line(server.url, polled(slow, [Toy.status]), polled(fast, [Toy.status]))))
 
 
@@ -214,7 +214,8 @@ def os_words_of_an_unknown_zone() -> str:
         ("rfc2217://127.0.0.1:{closed}", "nothing listens there"),
         (
             "127.0.0.1:502",
-            "for Modbus TCP write tcp://127.0.0.1:502, for RTU over TCP socket://127.0.0.1:502",
+            "a scheme is missing: write tcp://127.0.0.1:502 for Modbus TCP, or socket://127.0.0.1:502 for "
+            "RTU over TCP",
         ),
         ("socket://127.0.0.1", "the URL needs a host and a port number, such as socket://10.0.0.7:4001"),
         ("rfc2217://:4001", "the URL needs a host and a port number, such as rfc2217://10.0.0.7:4001"),

@@ -120,7 +120,7 @@ def test_a_port_is_reopened_only_with_the_same_adapter(
             if is_same:
                 found.reopen()
             else:
-                with pytest.raises(LineError, match="another adapter has this name now"):
+                with pytest.raises(LineError, match="this name now belongs to another adapter"):
                     found.reopen()
             assert found.is_lost != is_same
         found.close()
@@ -173,7 +173,7 @@ def test_another_adapter_with_the_same_serial_number_is_not_used(tmp_path: Path,
         found.open()
     with (
         sysfs.plugged_in(link, "1-2", "A1"),
-        pytest.raises(LineError, match="another adapter has this name now"),
+        pytest.raises(LineError, match="this name now belongs to another adapter"),
     ):
         found.reopen()
     with sysfs.plugged_in(link, "1-1", "A1"):
@@ -208,7 +208,9 @@ def test_a_new_pseudo_terminal_with_a_used_number_is_not_opened(tmp_path: Path, 
             found.reopen()
             found.close()
         else:
-            with pytest.raises(LineError, match=r"its pseudo-terminal is gone, and .* is another one"):
+            with pytest.raises(
+                LineError, match=r"the port's pseudo-terminal is gone, and another pseudo-terminal is now "
+            ):
                 found.reopen()
             assert found.is_lost
 
@@ -263,14 +265,14 @@ def test_a_port_that_leads_to_another_line_is_not_polled_and_gets_no_stop(
 
             until(lambda: seen("ok"))
         with sysfs.plugged_in(link, "1-2", "B2") as another:
-            until(lambda: "another adapter has this name now (B2:1.0.0, and not A1:1.0.0)" in caplog.text)
-            with pytest.raises(PortLost, match="another adapter has this name now"):
+            until(lambda: "this name now belongs to another adapter (B2:1.0.0, not A1:1.0.0)" in caplog.text)
+            with pytest.raises(PortLost, match="this name now belongs to another adapter"):
                 pump.stop(seconds=0.5)
             assert another.drives[0].counters.requests == 0
         statuses.clear()
         with sysfs.plugged_in(link, "1-3", "A1"):
             until(lambda: seen("ok"))
-    assert caplog.text.count("not opened again: another adapter") == 1
+    assert caplog.text.count("not opened again: this name now belongs to another adapter") == 1
 
 
 @table(

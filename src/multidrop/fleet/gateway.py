@@ -189,7 +189,7 @@ class FleetGateway:
             return
         if message.subject == names.gateway_subject(self.name, "drain"):
             self.member.drain()
-            _log.warning("%s: draining: all lines go to other gateways", self.name)
+            _log.warning("gateway %s is draining: all its lines go to other gateways", self.name)
         with suppress(Exception):  # the requester may have disconnected
             await message.respond(json.dumps(with_short_texts(self.state())).encode())
 

@@ -168,7 +168,9 @@ class Gateway:
             return None
         source = self.parts.source()
         if source is None:
-            raise OSError("[serve.fleet]: its files cannot be read yet, and the plant file has no lines")
+            raise OSError(
+                "the plant file has no lines, and the files that [serve.fleet] names cannot be read yet"
+            )
         source.on_change = partial(self.reload.begin, "the fleet")
         return source
 

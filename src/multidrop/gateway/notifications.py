@@ -112,7 +112,7 @@ def _shown(url: str) -> str:
     """Return the part of a target's URL that is not secret. Raises ValueError for an invalid URL."""
     scheme, separator, rest = url.partition("://")
     if not separator or not rest or not SCHEME.fullmatch(scheme):
-        raise ValueError("this is not a URL, such as https://HOST/PATH or ntfy://TOPIC")
+        raise ValueError("the target is not a URL; write one such as https://HOST/PATH or ntfy://TOPIC")
     if scheme not in ("http", "https"):
         return f"{scheme}://"
     try:
@@ -121,8 +121,8 @@ def _shown(url: str) -> str:
         host = user = None
     if not host or user is not None:
         raise ValueError(
-            "a webhook is https://HOST/PATH; if it needs a user's name and password, "
-            "it is json://USER:PASSWORD@HOST/PATH, which Apprise sends"
+            "the webhook is not of the form https://HOST/PATH. "
+            "With a user name and password, write json://USER:PASSWORD@HOST/PATH, which Apprise sends"
         )
     return f"{scheme}://{host}"
 

@@ -166,7 +166,7 @@ class LiveParts:
             if building.part.done():
                 self._start(name, building.part.result())
             else:
-                _log.warning("%s is not ready: it starts when its files answer", name)
+                _log.warning("%s starts later, when the disk with its files answers", name)
                 self.pending[name] = building
                 supervisor().start(f"{name} pending", self._start_when_built(name, building))
 
@@ -202,7 +202,7 @@ class LiveParts:
                 self.take_up()
             except Exception as failure:  # for example, another program has opened the part's port
                 self.dead[name] = str(failure)
-                _log.error("%s did not start again: %s", name, failure)
+                _log.error("%s could not be restarted: %s", name, failure)
 
     async def build(self, wanted: Mapping[str, Any], plant: Plant) -> None:
         """Build these parts concurrently, and wait up to BUILD_S.
@@ -248,7 +248,7 @@ class LiveParts:
             self._start(name, part)
             return
         self.dead[name] = str(failure)
-        _log.error("%s does not start: %s", name, failure)
+        _log.error("%s cannot start: %s", name, failure)
 
     def _start(self, name: str, part: Part) -> None:
         self.feeds[name] = part

@@ -36,7 +36,7 @@ def url_mistakes(url: str, example: str) -> Iterator[str]:
     except ValueError:
         parts, host, user, is_valid = urlsplit(""), None, None, False
     if user is not None or set(parse_qs(parts.query)) & {*SECRETS}:
-        yield 'url has a login in it; write token = "FILE" instead'
+        yield 'url contains a user, password or token; write token = "FILE" instead'
     elif parts.scheme not in ("http", "https") or not host or not is_valid:
         yield f'url = "{masked(url)}" is not a URL; write url = "{example}"'
 

@@ -239,8 +239,8 @@ def read_settings(plant: Plant, environment: Mapping[str, str]) -> ServeSettings
     is_safe = behind_proxy or {"tokens", "certificate", "key"} <= given.keys()
     if not is_loopback(host) and not is_safe and "listen" in given:
         place.wrong(
-            f'listen = "{given["listen"]}" is open to other machines: that needs tokens, certificate and '
-            "key, or behind_proxy = true; or listen on 127.0.0.1",
+            f'listen = "{given["listen"]}" is open to other machines. Add tokens, certificate and key, or '
+            "behind_proxy = true; or listen on 127.0.0.1",
             "listen",
         )
     audit = folders.state / given.get("audit", "audit.jsonl")
@@ -284,7 +284,8 @@ def _name(name: object) -> str:
 def _tls(given: Mapping[str, Any], folders: Folders, place: TomlPlace) -> ssl.SSLContext | None:
     paths = {key: folders.find(given[key]) for key in ("certificate", "key") if key in given}
     if len(paths) == 1:
-        place.wrong(f"{next(iter(paths))} alone is not enough: give certificate and key", next(iter(paths)))
+        only = next(iter(paths))
+        place.wrong(f"{only} alone is not enough: give both keys, certificate and key", only)
     found = [place.attempt(_check_readable, f"{key} {path}", path, key=key) for key, path in paths.items()]
     if found != [True, True]:
         return None

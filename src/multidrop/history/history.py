@@ -135,7 +135,7 @@ class History:
     def _check_merged(self, number: int, found: Listing) -> None:
         """Raise OSError if this segment was merged with segments whose rows were already yielded."""
         if any(file.first < number <= file.last for file in found.rows.values()):
-            raise OSError(f"{self.folder}: files were merged while they were read: read them again")
+            raise OSError(f"{self.folder}: files were merged during this read: read the history again")
 
     def _learnt(
         self, found: Listing, series: Sequence[Series] | None, begin: int, end: int, units: UnitHistory

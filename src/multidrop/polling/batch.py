@@ -51,8 +51,8 @@ def nanoarrow() -> Any:
         return importlib.import_module("nanoarrow")
     except ImportError as failure:
         raise ImportError(
-            "rows in Arrow's layout, such as the rows of a recording, need nanoarrow, which is not "
-            "installed: pip install nanoarrow",
+            "rows in Arrow's layout, such as the rows of a recording, need the package nanoarrow: "
+            "pip install nanoarrow",
             name="nanoarrow",
         ) from failure
 
@@ -109,7 +109,7 @@ class WideRows(ArrowTable):
         """
         for name in chosen:
             if not isinstance(name, str):
-                raise TypeError(f"wide takes names of columns as separate arguments, not {name!r}")
+                raise TypeError(f"wide takes column names as separate arguments, not {name!r}")
         self._columns = {name: _WideColumn() for name in chosen}
         self._times: dict[tuple[int, int], int] = {}  # row numbers by (time, monotonic_ns)
         self._starts = array(
@@ -323,8 +323,8 @@ class Rows(ArrowTable):
     def __array__(self, *how: object, **details: object) -> NoReturn:
         """Raise TypeError, because `pandas.DataFrame(batch)` would convert the rows to one array."""
         raise TypeError(
-            "a batch has columns of several types and is not one array: use batch.to_pandas(), "
-            "batch.to_polars(), or an Arrow library: pyarrow.record_batch(batch)"
+            "a batch cannot become one array, because its columns have several types. Use "
+            "batch.to_pandas(), batch.to_polars() or pyarrow.record_batch(batch)"
         )
 
     def __arrow_c_schema__(self) -> Any:

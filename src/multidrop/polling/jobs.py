@@ -34,8 +34,8 @@ class RowNames:
         for names, of in ((of_drives, "drives"), (of_registers, "registers")):
             if len(names) > MOST_NAMES:
                 raise ValueError(
-                    f"a poller can have at most {MOST_NAMES} different names of {of} during its life; this "
-                    f"poller would have {len(names)}; start another poller"
+                    f"a poller can have at most {MOST_NAMES} different names of {of} during its life. This "
+                    f"poller would have {len(names)}: start another poller"
                 )
 
     def layout(self, drive: Drive, block: Block) -> RowLayout:

@@ -73,7 +73,7 @@ class LineSet:
         name = drive if isinstance(drive, str) else drive.name
         line, known = drives.get(name, (None, None))
         if line is None or known is None or drive not in (name, known):
-            raise ValueError(f"{name} is not polled here; {did_you_mean(name, drives)}")
+            raise ValueError(f"this poller has no drive {name}; {did_you_mean(name, drives)}")
         return line, known
 
     # ---- opening and adding lines ----

@@ -140,7 +140,7 @@ class ParquetReader(RecordingReader):
             size = described.row_group(number).total_byte_size
             if size > MOST_OF_GROUP:
                 raise self._not_a_recording(
-                    f"a group of its rows takes {size} bytes unpacked; the limit is {MOST_OF_GROUP}"
+                    f"one of its row groups has {size} bytes unpacked; the limit is {MOST_OF_GROUP}"
                 )
 
     def _next(self, batches: Iterator[Any], rows: int) -> Any:

@@ -94,7 +94,9 @@ def plot(
     wanted = [series for series in chosen if not registers or series.register in registers]
     if not any(series.has_values for series in wanted):
         misses = _reasons(chosen)
-        raise ValueError(f"there is no value to draw, only misses: {misses}; `multidrop report` shows more")
+        raise ValueError(
+            f"there is no value to draw, only failed reads: {misses}; `multidrop report` shows more"
+        )
     panels = _panels([series for series in wanted if series.register != FAULTS], registers)
     shown = panels if registers else panels[:MOST_PANELS]
     contents = [_content(panel, chosen) for panel in shown]

@@ -140,7 +140,9 @@ class TestRun:
 
     def _check_speed(self, poller: Poller) -> None:
         if self._speed != 1.0 and not all(map(_is_simulated, poller.buses.values())):
-            raise ValueError("speed is for simulated drives, and a port of the plant has real ones")
+            raise ValueError(
+                "argument 'speed' changes simulated time, but a port of the plant is not simulated: remove it"
+            )
 
 
 def _is_simulated(bus: Bus) -> bool:
@@ -335,7 +337,7 @@ class _Session:
         self.take()
         self._raise_failure()
         if slow := next((thread for thread in self._row_threads if thread.has_lost), None):
-            raise _Aborted(f"more than {MOST_WAITING} batches waited for {slow.name}")
+            raise _Aborted(f"{slow.name} was too slow: more than {MOST_WAITING} batches were waiting")
         # Sleep of the computer during the run counts as silence, so that the run does not continue after it.
         if why := self._watch.silent(clock.boottime_ns() - self._slept_ns):
             raise _Aborted(why)
@@ -354,7 +356,7 @@ class _Session:
         now_ns = clock.boottime_ns()
         still_s = (now_ns - self._looked_ns) / 1e9
         if still_s > STILL_S:
-            raise _Aborted(f"the run stood still for {still_s:.1f} s")
+            raise _Aborted(f"the process of the run was suspended for {still_s:.1f} s")
         self._looked_ns = now_ns
 
     def _limit_ns(self) -> float:

@@ -100,7 +100,9 @@ class SpoolFolder:
             return log
         found = _parsed(path)
         if found.get("format") != FORMAT or not re.fullmatch(r"[0-9a-f]{16}", str(found.get("log"))):
-            raise SpoolError(f"{path} was damaged, or written by another version; expected {FORMAT!r}")
+            raise SpoolError(
+                f"{path} is damaged, or from another version of multidrop; expected format {FORMAT!r}"
+            )
         if found.get("gateway") != wanted["gateway"]:
             raise SpoolError(
                 f"{self.path} is the spool of gateway {found.get('gateway')!r}, not of {wanted['gateway']!r}"

@@ -93,8 +93,8 @@ def sweeps(
     ]
     if not found:
         raise ValueError(
-            "no family allows any of these addresses with any of these baud rates and formats; "
-            "choose more of them"
+            "no family allows any of these addresses with any of these baud rates and formats. "
+            "Allow more addresses, baud rates or formats"
         )
     found.sort(key=lambda weighted: -weighted[0] / weighted[1].needed)
     brisk = [sweep for _, sweep in found]
@@ -130,7 +130,7 @@ def _check(what: str, given: Collection[Any], known: set[Any]) -> None:
     for one in given:
         if one not in known:
             choices = ", ".join(map(str, sorted(known)))
-            raise ValueError(f"none of these families has {what} {one}; they have {choices}")
+            raise ValueError(f"none of these families allows {what} {one}; they allow {choices}")
 
 
 def _patient(sweep: Sweep) -> Sweep:

@@ -95,7 +95,7 @@ class Faults:
     def __post_init__(self) -> None:
         _check_rates(self)
         if not 1 <= self.burst <= MOST_BURST:
-            raise ValueError(f"burst = {self.burst!r} is not from 1 to {MOST_BURST} characters")
+            raise ValueError(f"burst = {self.burst!r} is not a number of characters from 1 to {MOST_BURST}")
 
 
 def rates_of(kind: type) -> list[str]:
@@ -184,15 +184,15 @@ class FaultyWire(Wire):
         super().__init__(drives, name=name, port=port, unpaced=unpaced)
         if faults.hang_up and port == "pty":
             raise ValueError(
-                f"{name}: a port that hangs up must be a link or a TCP port, so that it can come back under "
-                f"its name"
+                f"{name}: with `hang_up`, the port must be a link or a TCP port. "
+                "A new pseudo-terminal would have another name"
             )
         self._by_name = {sim.drive.name: sim for sim in drives}
         for drive, own in faults.drives.items():
             sim = self._by_name.get(drive)
             if sim and (own.trip or own.drift) and not isinstance(sim, MotorDrive):
                 raise ValueError(
-                    f"{name}: {drive} has no simulated motor, so it takes no trip and no drift: remove them"
+                    f"{name}: {drive} has no simulated motor: remove its keys `trip` and `drift`"
                 )
         self.faults = faults
         self.struck: Counter[str] = Counter()

@@ -214,7 +214,7 @@ def _no_value(register: Register[Any]) -> tuple[int, int]:
         return pattern, mask
     if register.is_float:
         return bits_of(math.nan, register.number_format), register.coding.mask
-    raise ValueError(f"{register.name} has no raw count that stands for a missing value")
+    raise ValueError(f"register {register.name} has no raw value that means 'no value'")
 
 
 def pack(table: Table, raw: int) -> bytes:

@@ -424,7 +424,9 @@ class Exchanges:
             clock.sleep(max(0, wait_ns) / 1e9)
             if made.permit is not None and self.line.queue is not port:
                 # a write needs another check of the drive's family on the reopened port
-                raise PortLost(self.line.port, "it was reopened while the write waited for late replies")
+                raise PortLost(
+                    self.line.port, "the port was reopened while the write waited for late replies"
+                )
             completion = self.peers.carry_out(drive, made, expires_ns=expires_ns)
         check_master(drive, completion)
         return completion

@@ -160,10 +160,10 @@ class RFC2217Port(rfc2217.Serial):
 
     def _internal_raw_write(self, data: bytes) -> None:
         if not self.is_open or not self._write_lock.acquire(timeout=LOCK_TIME):
-            raise serial.SerialException("the network accepts no bytes")
+            raise serial.SerialException("the network connection accepts no bytes")
         try:
             if _send_at_once(self._socket, data) < len(data):
-                raise serial.SerialException("the network accepts only a part of the bytes")
+                raise serial.SerialException("the network connection accepted only a part of the bytes")
         except OSError as failure:
             raise serial.SerialException(f"the connection failed: {failure}") from failure
         finally:

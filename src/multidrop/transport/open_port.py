@@ -146,7 +146,10 @@ def unopened(port: str) -> serial.Serial:
     if is_url and scheme.lower() not in known:
         raise NoSuchPort(port, f"the scheme {scheme}:// is not supported; write a URL such as {URLS}")
     if not is_url and _HOST_AND_PORT.fullmatch(port) and not Path(port).exists():
-        raise NoSuchPort(port, f"for Modbus TCP write tcp://{port}, for RTU over TCP socket://{port}")
+        raise NoSuchPort(
+            port,
+            f"a scheme is missing: write tcp://{port} for Modbus TCP, or socket://{port} for RTU over TCP",
+        )
     if url.scheme == "rfc2217":
         found = RFC2217Port()
         found.port = port
@@ -174,9 +177,8 @@ def check_port(port: str, mastership: Mastership | None) -> None:
     if is_bridged(unopened(port)) and mastership:
         raise NoSuchPort(
             port,
-            "a line with a mastership needs a port that the core writes to itself, such as "
-            "socket://10.0.0.7:4001 or a device: bytes that another thread forwards could leave after "
-            "another process has become master",
+            "a port of this kind cannot be used with a mastership. Use a device, or a port such as "
+            "socket://10.0.0.7:4001",
         )
 
 
@@ -291,7 +293,10 @@ class OpenPort:
         """
         found = pseudo_terminal_of(self.name)
         if self._terminal and found and self._terminal.is_replaced_by(found):
-            raise LineError(self.name, f"its pseudo-terminal is gone, and {found.device} is another one now")
+            raise LineError(
+                self.name,
+                f"the port's pseudo-terminal is gone, and another pseudo-terminal is now {found.device}",
+            )
         return found
 
     def _require_same_adapter(self, device: str) -> None:
@@ -300,9 +305,8 @@ class OpenPort:
         if self._adapter and (found is None or not self._adapter.is_same(found)):
             raise LineError(
                 self.name,
-                f"another adapter has this name now ({found or 'none on USB'}, and not {self._adapter}); "
-                "if that is intended, restart the program; a name in /dev/serial/by-id always means the same "
-                "adapter",
+                f"this name now belongs to another adapter ({found or 'none on USB'}, not {self._adapter}). "
+                "If that is intended, restart the program, or use a permanent name in /dev/serial/by-id",
             )
         had_twin = self._adapter is not None and self._adapter.has_twin
         self._adapter = found and replace(found, has_twin=had_twin or port_identity.has_twin(found))
@@ -397,7 +401,9 @@ class OpenPort:
         if self.settings == settings:
             return
         if self.settings:
-            raise LineError(self.name, "this kind of port cannot switch its settings between two drives")
+            raise LineError(
+                self.name, "this kind of port cannot change its baud rate or format between drives"
+            )
         try:
             set_up(self._serial, settings)
         except PORT_FAILURES as failure:

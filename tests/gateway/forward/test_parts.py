@@ -46,11 +46,11 @@ from multidrop.samples import SpoolState, unpack
         ),
         (
             '[serve.influx]\nurl = "http://anna:T0K3N@influx/write"',
-            '[serve.influx]: url has a login in it; write token = "FILE" instead',
+            '[serve.influx]: url contains a user, password or token; write token = "FILE" instead',
         ),
         (
             '[serve.influx]\nurl = "http://influx/write?db=a&p=T0K3N"',
-            '[serve.influx]: url has a login in it; write token = "FILE" instead',
+            '[serve.influx]: url contains a user, password or token; write token = "FILE" instead',
         ),
         (
             '[serve.upload]\nurl = "http://[T0K3N/"',

@@ -63,7 +63,7 @@ def test_openapi_describes_each_route_with_its_refusals(gateway: Served) -> None
 REFUSED = {
     "verb": ("/api/act", {"drive": "pump-1", "verb": "dance"}, 400, "there is no verb 'dance'"),
     "option": ("/api/act", {**START, "options": {"hz": 1}}, 400, "start has no option 'hz'"),
-    "id": ("/api/act", {**START, "id": "two words"}, 400, "id must be a string"),
+    "id": ("/api/act", {**START, "id": "two words"}, 400, "key 'id' must be a string"),
     "drive": ("/api/act", {**START, "drive": "pump-9"}, 404, "there is no drive 'pump-9'"),
     "stop": ("/api/act", {"drive": "pump-9", "verb": "stop"}, 404, "there is no drive 'pump-9'"),
     "drives": ("/api/stop", {"drives": ["pump-9"]}, 404, "there is no drive 'pump-9'"),

@@ -469,8 +469,11 @@ def test_a_limit_that_was_exceeded_before_a_restart_stays_exceeded() -> None:
     [
         ('register = "fault"\nabove = 1', "'drive' is missing"),
         ('drive = "pump-1"\nregister = "setpoint"\nabove = 1', "pump-1.setpoint is not polled"),
-        ('drive = "pump-1"\nregister = "fault"', "give either above or below"),
-        ('drive = "pump-1"\nregister = "fault"\nabove = 1\nbelow = 0', "give either above or below"),
+        ('drive = "pump-1"\nregister = "fault"', "give either key 'above' or key 'below'"),
+        (
+            'drive = "pump-1"\nregister = "fault"\nabove = 1\nbelow = 0',
+            "give either key 'above' or key 'below'",
+        ),
         ('drive = "pump-1"\nregister = "fault"\nabove = nan', "must be finite"),
         ('drive = "pump-1"\nregister = "fault"\nabove = 1\nhysteresis = -1', "hysteresis 0 or more"),
         ('drive = "pump-1"\nregister = "fault"\nabove = 1\nfor = "5"', "is not a duration"),

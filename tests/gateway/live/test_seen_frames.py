@@ -154,7 +154,10 @@ def test_a_delayed_command_is_not_sent(tmp_path: Path, path: str, body: dict[str
         with held_up(gateway, path, {**body, "seen": seen}) as client:
             pass_time(gateway, MOST_AGE_NS)
             told = answer(client)
-        assert told.endswith(f"frame {seen} is not from the last 5 s: check and confirm again")
+        assert told.endswith(
+            f"the values seen (frame {seen}) are not from the last 5 s. "
+            "Check the drive's values and confirm again"
+        )
         assert told.startswith("pump-1.")
         assert commands(gateway) == []
 
@@ -182,7 +185,8 @@ def test_a_start_is_not_sent_if_its_sender_saw_no_values_since_a_stop(tmp_path: 
         sent = commands(gateway)
         overtaken = gateway.post("/api/act", start, **writer).json["text"]
         assert overtaken == (
-            f"pump-1.start was not sent: a stop was called after frame {seen}: check and confirm again"
+            f"pump-1.start was not sent: a stop was called after the values seen (frame {seen}). "
+            "Check the drive's values and confirm again"
         )
         assert commands(gateway) == sent
         assert gateway.act("pump-1", "start")["done"] is True
@@ -231,7 +235,7 @@ def test_a_message_number_of_a_previous_process_is_refused(tmp_path: Path) -> No
         assert gateway.frame_number() != seen
         body = {**START, "seen": seen}
         told = gateway.post("/api/act", body, **gateway.writer).json
-        assert (told["done"], "is not from the last 5 s" in told["text"]) == (False, True)
+        assert (told["done"], "are not from the last 5 s" in told["text"]) == (False, True)
         assert commands(gateway) == []
 
 
@@ -242,7 +246,7 @@ def test_a_command_without_a_message_number_is_refused(gateway: Served, wrong: d
     acts = [{"drive": "pump-1", "verb": verb, "options": options} for verb, options in verbs.items()]
     for path, body in (("/api/write", WRITE), *(("/api/act", act) for act in acts)):
         found = gateway.post(path, {**body, **wrong}, **gateway.writer)
-        assert (found.status, found.json["error"].partition(" or")[0]) == (400, "seen is missing")
+        assert (found.status, found.json["error"].partition(" or")[0]) == (400, "key 'seen' is missing")
     assert (commands(gateway), gateway.gateway.commands.called) == (before, called)
 
 

@@ -381,7 +381,7 @@ def test_a_connection_is_accepted_after_a_failed_attempt(rig: Rig, monkeypatch: 
 def test_a_symlink_is_replaced_only_if_a_killed_gateway_made_it(tmp_path: Path) -> None:
     link = tmp_path / "port"
     link.write_text("a file")
-    with pytest.raises(OSError, match="it exists, and no gateway made it"):
+    with pytest.raises(OSError, match="a file of this name exists, and no gateway made it"):
         Terminal(link)
     assert link.read_text() == "a file"
     link.unlink()
@@ -390,7 +390,7 @@ def test_a_symlink_is_replaced_only_if_a_killed_gateway_made_it(tmp_path: Path) 
     with pytest.raises(OSError, match="no gateway made it"):
         Terminal(other)
     killed = Terminal(link)
-    with pytest.raises(OSError, match=f"the link {link} cannot be made: another gateway uses it"):
+    with pytest.raises(OSError, match=f"the link {link} cannot be made: another gateway uses this link"):
         Terminal(link)
     assert killed._lock is not None
     killed._lock.close()  # the kernel also releases the lock of a killed process

@@ -388,9 +388,9 @@ def test_a_payload_for_another_drive_is_refused(broker: Broker, listener: Listen
         (b"25", "the message is not a JSON object"),
         (b'{"value": 25}', "time is missing"),
         (b'{"time": 25}', "value is missing"),
-        (b'{"value": "25", "time": 1}', "value is '25', not a number"),
-        (b'{"value": true, "time": 1}', "value is True, not a number"),
-        (b'{"value": 25, "time": "1"}', "time is not a whole number of ms"),
+        (b'{"value": "25", "time": 1}', "key 'value' is '25', not a number"),
+        (b'{"value": true, "time": 1}', "key 'value' is True, not a number"),
+        (b'{"value": 25, "time": "1"}', "key 'time' is not a whole number of ms"),
         (b"\xc3\x28", "codec"),
         (b"[" * 60_000, "nested too deeply"),
         (b'{"value": 25, "time": 1}' + b" " * 70_000, "the message has 70024 bytes"),
@@ -671,7 +671,7 @@ def test_all_mistakes_in_the_mqtt_settings_are_reported(tmp_path: Path) -> None:
         MqttSettings("http://x", prefix="a/+", every="soon", sparkplug="a/b", node="#")
     sentences = str(told.value).splitlines()
     assert len(sentences) == 5
-    assert sentences[0].startswith('broker = "http://x" is not a broker\'s URL; write broker = "mqtt://')
+    assert sentences[0].startswith('broker = "http://x" is not a broker\'s URL; write one such as "mqtt://')
 
 
 def test_invalid_certificate_authorities_are_reported_before_polling_starts(tmp_path: Path) -> None:

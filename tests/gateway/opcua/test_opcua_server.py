@@ -428,7 +428,7 @@ CHANNEL = '[[line.drive.channel]]\nname = "{}"\nvalue = "output_frequency / 2"\n
         ('listen = "4840"', (), 'not an address and port; write listen = "127.0.0.1:4840"'),
         ('listen = "0.0.0.0:4840"', (), OPEN),
         ('listen = "0.0.0.0:4840"\ncertificate = "plant.toml"\nkey = "plant.toml"', (), OPEN),
-        ('certificate = "cert.pem"', (), "certificate and key belong together: give both, or none"),
+        ('certificate = "cert.pem"', (), "certificate and key belong together: give both keys, or neither"),
         ('certificate = "cert.pem"\nkey = "plant.toml"', (), 'certificate = "cert.pem": there is no file'),
         ("port = 4840", (), "unknown key 'port'"),
         ("", ("a", "a.status"), 'drive "a.status" has the node id of a value of "a": choose another name'),

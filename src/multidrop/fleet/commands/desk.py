@@ -240,7 +240,7 @@ class StopDesk:
         request, why_all = read_stop(data)
         if why_all:
             _log.warning(
-                "all drives of line %s are stopped, because a stop message is damaged: %s", line, why_all
+                "stopping all drives of line %s, because a stop message is damaged: %s", line, why_all
             )
         if request.drives is not None:
             request = request._replace(drives=tuple(drive_meant(one, held.drives) for one in request.drives))

@@ -253,7 +253,10 @@ class Lease:
         self.held[path] = None
         self._ended.add(path)
         _log.warning(
-            "%s: another gateway ended lease record %d of 3 (session %d)", self.name, path + 1, self.session
+            "gateway %s: another gateway ended lease record %d of 3 (session %d)",
+            self.name,
+            path + 1,
+            self.session,
         )
 
     async def _take_late(self, path: int) -> None:

@@ -438,4 +438,4 @@ async def _compact(words: Sequence[str]) -> None:
         raise
     if child.returncode:
         last = said.decode("utf-8", "replace").strip().splitlines()[-1:]
-        _log.error("compaction ended with %d: %s", child.returncode, *(last or ["no message"]))
+        _log.error("compaction ended with status %d: %s", child.returncode, *(last or ["no message"]))

@@ -83,7 +83,7 @@ def check_clock(path: ServerPath, server_time: Any) -> None:
         raise OutcomeUnknown(f"the answer of {path.url} about a bucket has no valid time stamp") from None
     if abs(apart) > CLOCKS_APART_S:
         _log.warning(
-            "this machine's clock is %.0f s %s that of %s: set it, because samples get its time",
+            "this machine's clock is %.0f s %s the clock of %s: set it, because samples get its time",
             abs(apart),
             "ahead of" if apart > 0 else "behind",
             path.url,

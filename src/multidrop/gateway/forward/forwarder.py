@@ -282,7 +282,7 @@ class RowForwarder(RetryingSender):
     def _leave_out(self, stored: StoredMessage, why: str) -> None:
         self._refusals.pop(stored.sequence, None)
         self.refused += stored.rows
-        _log.error("%s does not get %d rows: %s", self.name, stored.rows, printable(why)[:200])
+        _log.error("%s does not receive %d rows: %s", self.name, stored.rows, printable(why)[:200])
 
 
 # ---- the part of the gateway ----

@@ -90,7 +90,7 @@ class PostgresReceiver:
             values = (*positions[0], self._log, *positions[1])
             if self._tables.connection.execute(MOVE, values).rowcount != 1:
                 raise SinkError(
-                    f"another program has changed the entry of the spool {self._log} in multidrop.spools"
+                    f"another program has changed the spool {self._log} in the table multidrop.spools"
                 )
             self._tables.insert([message.rows])
         self._kept = after

@@ -123,14 +123,16 @@ class Guard:
         if len(hosts) != 1 or not self._names.has_host(hosts[0]):
             name = hosts[0] if hosts else ""
             raise Denied(
-                421, f"{name[:100]!r} is not a name of this gateway; if it is, add it to names of [serve]"
+                421,
+                f"{name[:100]!r} is not a known name of this gateway. To allow the name, add it to names of "
+                "[serve] in the plant file",
             )
         path: str = scope["path"]
         needed = self._find(path)
         if path not in MAY_STOP and _length(scope) > MOST_HEAD:
             raise Denied(431, f"the headers are longer than {MOST_HEAD} bytes")
         if scope["method"] != needed.method and (scope["method"], needed.method) != ("HEAD", "GET"):
-            raise Denied(405, f"{path[:100]!r} takes only {needed.method}")
+            raise Denied(405, f"{path[:100]!r} takes only the method {needed.method}")
         self._check_site(headers, hosts[0], needed, SCHEMES if self._behind_proxy else (scope["scheme"],))
         if needed.right is None:
             return Caller(ANYONE, "page", self.address(scope, headers), Right.LOOK)
@@ -184,15 +186,15 @@ class Guard:
             scope[HAS_WRONG_TOKEN] = True
         caller = caller_with(token, free, way, address)
         if caller is None:
-            raise Denied(401, "a token is needed")
+            raise Denied(401, "this request needs a token")
         if caller.role >= needed:
             return caller
         if token is None:
-            raise Denied(401, f"this needs a token to {needed.name.lower()}")
+            raise Denied(401, f"this request needs a token with the right to {needed.name.lower()}")
         raise Denied(
             403,
-            f"{caller.name} has only the right to {caller.role.name.lower()}, but this needs the right to "
-            f"{needed.name.lower()}",
+            f"{caller.name} has only the right to {caller.role.name.lower()}, but this request needs the "
+            f"right to {needed.name.lower()}",
         )
 
     def address(self, scope: Scope, headers: Headers) -> str:

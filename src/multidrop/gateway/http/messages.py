@@ -148,7 +148,7 @@ def commander_in(request: Request, body: Mapping[str, Any]) -> Caller:
 def text_in(body: Mapping[str, Any], key: str) -> str:
     value = body.get(key)
     if not isinstance(value, str) or not value:
-        raise Denied(400, f"{key} is missing or not a text")
+        raise Denied(400, f"key {key!r} is missing or not a text")
     return value
 
 
@@ -156,7 +156,9 @@ def frame_in(body: Mapping[str, Any]) -> int:
     """Return the number of the newest frame that a command's sender has seen. Raises Denied without one."""
     seen = body.get("seen")
     if not is_whole(seen) or not 0 <= seen < 1 << 63:
-        raise Denied(400, "seen is missing or not a whole number: give the n of your newest frame")
+        raise Denied(
+            400, "key 'seen' is missing or not a whole number: give the number n of the newest frame received"
+        )
     return seen
 
 

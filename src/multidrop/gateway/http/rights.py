@@ -61,7 +61,7 @@ class Caller(NamedTuple):
         if given is None:
             return self._replace(command=self.command or secrets.token_hex(8))
         if not isinstance(given, str) or not COMMAND_ID.fullmatch(given):
-            raise ValueError("id must be a string of 1 to 64 ASCII characters without spaces")
+            raise ValueError("key 'id' must be a string of 1 to 64 ASCII characters without spaces")
         return self._replace(command=given)
 
     def stopping(self, given: object = None) -> Caller:
@@ -96,7 +96,7 @@ def new_token(name: str, right: Right) -> tuple[str, Token]:
     """Return a new secret and its token. Raises ValueError for an invalid name."""
     if not NAME.fullmatch(name):
         raise ValueError(
-            f"{name!r} cannot name a token: use up to 64 letters, digits and . _ @ -, a letter or digit first"
+            f"invalid owner {name!r}: use up to 64 letters, digits and . _ @ -, a letter or digit first"
         )
     secret = secrets.token_urlsafe(32)
     return secret, Token(name, right, digest(secret))

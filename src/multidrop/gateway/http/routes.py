@@ -290,7 +290,7 @@ class Pages(PageFiles):
         body = await body_of(request)
         alarm, note = text_in(body, "alarm"), body.get("note", "")
         if not isinstance(note, str) or len(note) > MOST_NOTE or not note.isprintable():
-            raise Denied(400, f"note must be a text of at most {MOST_NOTE} printable characters")
+            raise Denied(400, f"key 'note' must be a text of at most {MOST_NOTE} printable characters")
         try:
             found = self._gateway.alarms.acknowledge(alarm, utc_ms(), caller_of(request).by, note.strip())
         except KeyError:
@@ -336,7 +336,10 @@ class Pages(PageFiles):
         """Stop all drives of the fleet. This needs the key file that `commander` in `[serve.fleet]` names."""
         part: Any = self._gateway.feeds.get("fleet")
         if part is None or not part.can_stop:
-            raise Denied(404, "this gateway cannot stop the fleet; add commander to [serve.fleet]")
+            raise Denied(
+                404,
+                "this gateway cannot stop the fleet; add key 'commander' to [serve.fleet] in the plant file",
+            )
         caller = caller_of(request)
         _log.warning("stop of the whole fleet, asked for by %s", caller.by)
         return await _answer_stop(self._begin_stop("fleet", partial(part.stop, caller.by)), _answer_fleet)
@@ -345,7 +348,7 @@ class Pages(PageFiles):
         body = await body_of(request)
         value = body.get("value")
         if not is_number(value):
-            raise Denied(400, "value is missing or not a number")
+            raise Denied(400, "key 'value' is missing or not a number")
         drive, register = text_in(body, "drive"), text_in(body, "register")
         caller = commander_in(request, body)
         admit = self._admission(drive, (register, value, caller_of(request)), body)
@@ -359,7 +362,7 @@ class Pages(PageFiles):
         # wrong options must not prevent a stop, so a stop ignores all options
         options = {} if verb in STOPPING else body.get("options", {})
         if not isinstance(options, dict):
-            raise Denied(400, "options is not a JSON object")
+            raise Denied(400, "key 'options' is not a JSON object")
         sender = caller_of(request)
         caller = sender.stopping(body.get("id")) if verb in STOPPING else commander_in(request, body)
         admit = self._admission(drive, (verb, repr(options), sender), body)
@@ -379,7 +382,9 @@ class Pages(PageFiles):
 
     async def reload(self, request: Request) -> Response:
         if (await body_of(request)).get("confirm") is not True:
-            raise Denied(400, 'a reload changes what is polled: confirm it with {"confirm": true}')
+            raise Denied(
+                400, 'a reload can change the polled drives: confirm it with {"confirm": true} in the body'
+            )
         result = await self._gateway.reload.carry_out(caller_of(request).by)
         return JsonResponse(
             {

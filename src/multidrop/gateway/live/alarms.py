@@ -404,7 +404,9 @@ def _limit(given: Mapping[str, Any], lasting_s: float, units: Mapping[tuple[str,
         raise ValueError(f"{drive}.{register} is not polled: only polled values can have a limit")
     sides = [side for side in ("above", "below") if side in given]
     if len(sides) != 1:
-        raise ValueError("give either above or below; for both, write two tables [[serve.limit]]")
+        raise ValueError(
+            "give either key 'above' or key 'below'. For both limits, write two tables [[serve.limit]]"
+        )
     bound, hysteresis = float(given[sides[0]]), float(given.get("hysteresis", 0.0))
     if not isfinite(bound) or not 0 <= hysteresis < float("inf"):
         raise ValueError(f"{sides[0]} and hysteresis must be finite numbers, and hysteresis 0 or more")

@@ -315,14 +315,21 @@ class SeenFrames:
         made_ns = self._made.get(seen)
         until_ns = 0 if made_ns is None else made_ns + MOST_AGE_NS
         if made_ns is None or self.clock() > until_ns:
-            last = f"frame {seen} is not from the last {MOST_AGE_S:g} s"
-            raise WriteForbidden(f"{what} was not sent: {last}: check and confirm again", rule=TOO_LATE)
+            last = f"the values seen (frame {seen}) are not from the last {MOST_AGE_S:g} s"
+            raise WriteForbidden(
+                f"{what} was not sent: {last}. Check the drive's values and confirm again", rule=TOO_LATE
+            )
         if (self._commands.plant_ns or 0) >= made_ns:  # the drive's name may mean another drive now
-            since = f"the plant file was reloaded after frame {seen}"
-            raise WriteForbidden(f"{what} was not sent: {since}: check and confirm again", rule=ANOTHER_PLANT)
+            since = f"the plant file was reloaded after the values seen (frame {seen})"
+            raise WriteForbidden(
+                f"{what} was not sent: {since}. Check the drive's values and confirm again",
+                rule=ANOTHER_PLANT,
+            )
         if (self._commands.stopped_ns(drive) or 0) >= made_ns:
-            since = f"a stop was called after frame {seen}"
-            raise WriteForbidden(f"{what} was not sent: {since}: check and confirm again", rule=OVERTAKEN)
+            since = f"a stop was called after the values seen (frame {seen})"
+            raise WriteForbidden(
+                f"{what} was not sent: {since}. Check the drive's values and confirm again", rule=OVERTAKEN
+            )
         came = self._came.setdefault(seen, set())
         if command in came:
             first = "see the answer to the first request"

@@ -70,8 +70,8 @@ class Terminal:
         except OSError as failure:
             self._close_descriptors()
             why = {
-                FileExistsError: "it exists, and no gateway made it",
-                BlockingIOError: "another gateway uses it",
+                FileExistsError: "a file of this name exists, and no gateway made it",
+                BlockingIOError: "another gateway uses this link",
             }.get(type(failure), failure.strerror)
             raise OSError(f"pty: the link {link} cannot be made: {why}") from failure
 

@@ -135,12 +135,14 @@ def parse_broker(text: str) -> Address:
         parts, port = urlsplit(""), None
     if "@" in text:
         raise ValueError(
-            f'broker = "{masked(text)}" has a login in it; write user = "name" and password = "FILE" instead'
+            f'broker = "{masked(text)}" contains a user or password; write user = "name" and '
+            'password = "FILE" instead'
         )
     is_plain = not (parts.path.strip("/") or parts.query or parts.fragment or parts.username)
     if parts.scheme not in PORTS or not parts.hostname or not is_plain:
         raise ValueError(
-            f'broker = "{text}" is not a broker\'s URL; write broker = "mqtt://broker:1883", or mqtts://'
+            f'broker = "{text}" is not a broker\'s URL; write one such as "mqtt://broker:1883", or '
+            "mqtts:// for TLS"
         )
     return Address(parts.hostname, port or PORTS[parts.scheme], parts.scheme == "mqtts")
 

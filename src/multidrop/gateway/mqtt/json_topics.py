@@ -210,7 +210,7 @@ class JsonTopics:
             self._refuse(drive, what, mistake, named)
 
     def _refuse(self, drive: str, what: list[str], mistake: ValueError, named: object = None) -> None:
-        why = f"it is not {EXAMPLES[what[0]]}: {mistake}"
+        why = f"the message is not {EXAMPLES[what[0]]}: {mistake}"
         self._commands.refuse(drive, "/".join(what), why, named)
 
     def _to_stop(self, drive: str, given: Mapping[str, Any]) -> list[str]:
@@ -312,7 +312,7 @@ def _read_write(given: Mapping[str, Any]) -> tuple[float, int]:
     _check_keys(given, "value", "time")
     value = given["value"]
     if not is_number(value):
-        raise ValueError(f"value is {value!r}, not a number")
+        raise ValueError(f"key 'value' is {value!r}, not a number")
     return value, _time(given)
 
 
@@ -330,14 +330,14 @@ def _options(drive: str, given: Mapping[str, Any]) -> dict[str, object]:
         raise ValueError(f"the message names drive {given['drive']!r}, but its topic names {drive!r}")
     options = given.get("options", {})
     if not isinstance(options, dict):
-        raise ValueError("options is not an object")
+        raise ValueError("key 'options' is not a JSON object")
     return options
 
 
 def _time(given: Mapping[str, Any]) -> int:
     time: object = given["time"]
     if not is_whole(time):
-        raise ValueError("time is not a whole number of ms")
+        raise ValueError("key 'time' is not a whole number of ms")
     return time
 
 

@@ -62,7 +62,7 @@ class OpcUaSettings:
 
     def __post_init__(self) -> None:
         if bool(self.certificate) != bool(self.key):
-            raise ValueError("certificate and key belong together: give both, or none")
+            raise ValueError("certificate and key belong together: give both keys, or neither")
         _ = self.address
 
     @property
