@@ -120,7 +120,7 @@ def hostile_wires(plant: Path, faults: Faults) -> list[Wire]:
 
 @contextmanager
 def running(make: Callable[..., Sequence[Wire]], *arguments: object) -> Iterator[RunningPlant]:
-    """Start a process that simulates lines: the wires that `make(*arguments)` returns there."""
+    """Start a process that calls `make(*arguments)` and simulates the lines (wires) that it returns."""
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     late = context.Array("d", 2)  # the longest delay in s; the time of the last long delay

@@ -203,7 +203,9 @@ def test_an_exit_task_may_be_finished_on_any_thread(caught: list[int]) -> None:
     assert caught == [signal.SIGTERM]
 
 
-def test_buses_opened_during_a_close_get_signals(caught: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sigterm_stops_a_bus_that_was_opened_while_another_bus_closed(
+    caught: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Otherwise SIGTERM would end the process and leave the new bus's motors running."""
     hook, acts = ExitHook(), [Act(), Act()]
     first, let_go = hook.add(acts[0].begin, acts[0].work), hook._let_go

@@ -87,7 +87,9 @@ def test_closing_a_history_writer_writes_all_rows(tmp_path: Path, writers: Write
     assert writer.state().dropped == 20
 
 
-def test_batches_with_different_names_for_one_code_are_recorded(tmp_path: Path, writers: Writers) -> None:
+def test_batches_in_which_number_0_means_different_drives_are_recorded(
+    tmp_path: Path, writers: Writers
+) -> None:
     """Batches come from several pollers, and each poller numbers its drives from 0."""
     writer = writers(tmp_path)
     taken = [

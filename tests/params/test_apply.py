@@ -310,7 +310,9 @@ def test_a_stop_while_parameters_are_read_cancels_all_writes(
 
 # `room` is the number of free bytes on the disk. Each number lets a different line of the journal fail.
 @table("room", [0, 100, 130, 160, 200, 230])
-def test_an_application_is_completed_after_a_full_disk(monkeypatch: pytest.MonkeyPatch, room: int) -> None:
+def test_applying_parameters_can_be_completed_after_a_full_disk(
+    monkeypatch: pytest.MonkeyPatch, room: int
+) -> None:
     line, drive, _ = attached(ErmanERG220(1), [])
     # the EEPROM ledger is not affected by the full disk
     monkeypatch.setattr(Ledger, "enter", lambda *given: "")

@@ -414,7 +414,7 @@ def test_the_bus_cycle_is_not_repeated_while_a_drive_needs_pauses() -> None:
     assert schedule.cycle(0) == [other]
 
 
-def test_a_removed_poll_is_not_sent_after_the_pause_of_its_drive() -> None:
+def test_a_removed_poll_is_not_sent_when_its_drive_may_be_asked_again() -> None:
     schedule: Schedule[Job] = Schedule()
     other = Job(drive=2, period_ns=None, duration_ns=10)
     first, second = (Job(drive=1, period_ns=None, duration_ns=10, interval_ns=1000) for _ in range(2))

@@ -431,7 +431,7 @@ def test_multidrop_is_not_compiled_again():
 
 
 @pytest.mark.slow
-def test_ten_tests_of_another_package_pass_in_parallel(
+def test_documented_pytest_examples_pass_in_parallel_processes(
     tmp_path: Path, simulated_plant: Callable[..., SimulatedPlant], run: Callable[..., tuple[int, str, str]]
 ) -> None:
     for name, text in re.findall(r"```(?:toml|python)\n# ([\w-]+\.\w+)\n(.*?)```", PAGE.read_text(), re.S):

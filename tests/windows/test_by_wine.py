@@ -328,7 +328,7 @@ def test_console_prints_all_letters(wine: Wine, plant: Path) -> None:
 
 
 @pytest.mark.parametrize("form", ["8E1", "8O1", "8N2"])
-def test_a_port_is_set_to_parity_and_stop_bits(wine: Wine, pump: MotorDrive, form: str) -> None:
+def test_a_windows_port_accepts_parity_and_stop_bits(wine: Wine, pump: MotorDrive, form: str) -> None:
     """Check only that the port accepts both settings, because a pseudo-terminal does not use them."""
     ran = wine.run("-m", "multidrop", "state", "COM5", "invt-che", 1, "--format", form)
     assert ran.returncode == 0, ran.stderr

@@ -72,7 +72,7 @@ def poll(job: Lines) -> dict[str, Any]:
         left, seconds = _thread_seconds(), time.monotonic() - begun
         in_python = {thread.native_id for thread in threading.enumerate()}
         if lost := adapter.dropped(poller) - dropped:
-            raise AssertionError(f"{lost} rows were not taken, of {good + bad}")
+            raise AssertionError(f"the poller dropped {lost} rows, besides {good + bad} rows that were taken")
     spent = {thread: left[thread] - used.get(thread, 0.0) for thread in left}
     return {
         "exchanges": good // jobs.REGISTERS,

@@ -120,7 +120,7 @@ class GrowingSegment:
         return list(_rows(columns, wanted, begin, end))
 
     def gather(self, found: Mapping[Series, Accumulator], grid: Grid) -> None:
-        """Add the series' rows in this segment to their buckets of the grid."""
+        """Add this segment's rows of the series in `found` to the accumulators, in the buckets of `grid`."""
         with self._changing:
             if grid.is_of_tens:
                 self._gather_tens(found, grid)

@@ -165,7 +165,7 @@ class UnitHistory:
         return tuple(one for one in self._series or () if self._is_newest(one, number))
 
     def is_whole(self, first: int, last: int) -> bool:
-        """Return True if the segments `first` to `last` have no values in an earlier unit of their series."""
+        """Return True if all values in segments `first` to `last` have the newest unit of their series."""
         return not self.left_out or all(
             self._is_newest(one, number) for one in self.left_out for number in range(first, last + 1)
         )

@@ -133,9 +133,9 @@ def _lines(plan: RunPlan) -> list[_LineTime]:
 
 
 def longest_pause(plan: RunPlan) -> float:
-    """Return the longest planned time in s between two values of a series that the run needs.
+    """Return the longest planned time in s between two values of one register, over all necessary registers.
 
-    The run needs each register in a condition, each fault code, and at least one register of each drive.
+    These are the registers in conditions, the fault codes, and at least one register of each drive.
     """
     compared = {*plan.faults, *((condition.drive, condition.register) for condition in plan.conditions)}
     pauses = [one.prediction.cycle for one in _lines(plan)]

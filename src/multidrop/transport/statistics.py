@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from multidrop.transport.exchange import Exchanges
 
 
-LOOKS = 3  # attempts to read all counters before another exchange ends
+# All counters must be read while no exchange ends, so that they fit together. This is the number of attempts.
+LOOKS = 3
 _EPOCHS = count(1)
 
 

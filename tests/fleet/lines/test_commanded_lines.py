@@ -106,7 +106,7 @@ async def test_a_gateway_answers_stops_of_a_closing_line_until_it_is_closed(desk
     assert desk.written == {"control"}
 
 
-async def test_a_stop_is_answered_only_on_an_inbox(desk: Desks) -> None:
+async def test_a_stop_is_answered_only_on_a_reply_subject_of_nats(desk: Desks) -> None:
     """If a requester names a plant record's subject for the answer, the answer would replace the record."""
     answered: list[str] = []
 

@@ -185,7 +185,9 @@ PLANTS = re.findall(r"```toml\n# ([\w-]+\.toml)\n(.*?)```", PAGE, re.DOTALL)
 
 
 @table(("name", "text"), PLANTS, ids=[name for name, _ in PLANTS])
-def test_plant_files_on_the_documentation_page_of_modbus_load(tmp_path: Path, name: str, text: str) -> None:
+def test_example_plant_files_in_the_modbus_documentation_are_valid(
+    tmp_path: Path, name: str, text: str
+) -> None:
     path = tmp_path / name
     path.write_text(text)
     assert isinstance(read_settings(Plant.load(path), {}).parts["modbus"], ModbusSettings)

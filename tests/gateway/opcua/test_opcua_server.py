@@ -501,7 +501,7 @@ def test_each_row_has_the_expected_opc_ua_status_code(
         (hub.Shown(hub.SILENT, "no reply"), ("Bad_NoCommunication", None)),
     ],
 )
-def test_no_fault_is_reported_only_if_polled_values_prove_it(
+def test_an_empty_fault_text_has_status_good_only_if_polled_values_prove_it(
     shown: hub.Shown, expected: tuple[str, str | None]
 ) -> None:
     code, text = fault_of(shown)

@@ -42,10 +42,10 @@ MEANING: dict[str, tuple[Message, dict[str, Message | FrameFault]]] = {
             "01 83 03 01 31": Message(1, 0x03, exception=3),
         },
     ),
-    "01 04 00 01 00 05 61 C9": (  # erratum E1: here the checksum is corrected
+    "01 04 00 01 00 05 61 C9": (  # ERMAN erratum E1: here the checksum is corrected
         Message(1, 0x04, 1, 5),
         {
-            # erratum E2: wrong byte count
+            # ERMAN erratum E2: wrong byte count
             "01 04 10 01 F4 00 00 00 D6 00 00 02 32 0A 03": FrameFault.BAD_LENGTH,
             "01 04 0A 01 F4 00 00 00 D6 00 00 02 32 7F 1B": Message(
                 1, 0x04, 1, 5, words(500, 0, 214, 0, 562)
@@ -57,7 +57,7 @@ MEANING: dict[str, tuple[Message, dict[str, Message | FrameFault]]] = {
         Message(1, 0x05, 0, data=ON),
         {"same": Message(1, 0x05, 0, data=ON), "01 85 03 02 91": Message(1, 0x05, exception=3)},
     ),
-    "01 06 00 01 01 1D 19 93": (  # erratum E3: a valid frame that the library must never send
+    "01 06 00 01 01 1D 19 93": (  # ERMAN erratum E3: a valid frame, but it must never be sent
         Message(1, 0x06, 1, data=words(285)),
         {},
     ),
@@ -65,7 +65,7 @@ MEANING: dict[str, tuple[Message, dict[str, Message | FrameFault]]] = {
         Message(1, 0x06, 2, data=words(285)),
         {"same": Message(1, 0x06, 2, data=words(285)), "01 86 03 02 61": Message(1, 0x06, exception=3)},
     ),
-    "01 0F 00 00 00 09 02 01 01 25 2C": (  # erratum E4: a valid frame that the library must never send
+    "01 0F 00 00 00 09 02 01 01 25 2C": (  # ERMAN erratum E4: a valid frame, but it must never be sent
         Message(1, 0x0F, 0, 9, bytes([0x01, 0x01])),
         {"01 0F 00 00 00 09 95 CD": Message(1, 0x0F, 0, 9), "01 8F 03 04 31": Message(1, 0x0F, exception=3)},
     ),
@@ -77,7 +77,7 @@ MEANING: dict[str, tuple[Message, dict[str, Message | FrameFault]]] = {
         Message(1, 0x08, 0, data=words(0xA537)),
         {
             "same": Message(1, 0x08, 0, data=words(0xA537)),
-            "01 89 01 86 50": Message(1, 0x08, exception=1),  # erratum E13: 89H is a misprint of 88H
+            "01 89 01 86 50": Message(1, 0x08, exception=1),  # ERMAN erratum E13: 89H is a misprint of 88H
             "01 88 01 87 C0": Message(1, 0x08, exception=1),
         },
     ),

@@ -133,7 +133,8 @@ def run_loop(work: Coroutine[Any, Any, T]) -> T:
 
     try:
         with ExitStack() as stack:
-            # signals are only noted, because Python would print a traceback for an incomplete event loop
+            # Do not let a signal interrupt the construction of the event loop: Python would print a
+            # traceback. The signal is only noted here, and raised below.
             with noting_signals() as interruption:
                 runner = stack.enter_context(asyncio.Runner())
             if interruption.came:

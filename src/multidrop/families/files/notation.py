@@ -33,10 +33,10 @@ class Counting:
     assumed: list[int | str] = field(default_factory=list)
 
     def address(self, given: Any, table: str | None, default: str) -> tuple[int, str]:
-        """Convert an address in a TOML file to an address in requests, and the name of its table.
+        """Parse a register's address in a TOML file. Return the address in requests, and the table's name.
 
         `table` is the table that the register states, `default` the table if it states none. Raises
-        ValueError with a valid example for an invalid address.
+        ValueError if the address is invalid; the error gives a valid example.
         """
         if isinstance(given, bool) or not isinstance(given, (int, str)):
             raise ValueError(f'{given!r} is not an address; write 0x2000, 8192, "2000H" or "40001"')
@@ -130,7 +130,7 @@ def text(cell: str) -> str:
 
 
 def number(cell: str) -> int | float:
-    """Parse a decimal or hex number. Raises ValueError with a valid example for other texts."""
+    """Parse a decimal or hex number. Raises ValueError with a valid example if the text is no such number."""
     if match := _HEX_COUNT.fullmatch(cell):
         return int(match[1] or match[2], 16)
     if _WHOLE.fullmatch(cell) and len(cell) <= 20:

@@ -107,7 +107,10 @@ def _age_ms(now: Times, asked: Times) -> int:
 
 
 class TimeNumbers(dict[Times, int]):
-    """A dict that gives each request time a number: 0, 1, 2 and so on. Equal times have the same number."""
+    """The distinct times at which values were requested, each mapped to its index.
+
+    A lookup of a new time adds it with the next index: 0, 1, 2 and so on.
+    """
 
     def __missing__(self, time: Times) -> int:
         self[time] = number = len(self)

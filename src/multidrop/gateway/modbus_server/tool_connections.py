@@ -219,8 +219,8 @@ def _request_length(came: bytearray, is_in_step: bool) -> int | None:
         return None
     if found != FrameFault.BAD_FUNCTION:
         return max(found, 0)
-    # A request with an unknown function has an unknown length. But a tool waits for the reply to a request,
-    # so the last received byte is the request's last byte.
+    # The length of a request with an unknown function is unknown. But the client sends nothing more until it
+    # gets the reply, so all received bytes belong to this request.
     if not is_in_step or came[1] >= EXCEPTION or len(came) > MOST_FRAME:
         return 0
     return None if crc16(bytes(came), len(came)) else len(came)

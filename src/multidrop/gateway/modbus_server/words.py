@@ -111,7 +111,7 @@ def _nearest_count(register: Register[Any], value: float) -> float | None:
         return raw if abs(raw * multiplier) + abs(addend) <= _MOST_EXACT else None
     code, _ = _FLOATS[register.coding.number_format]
     held: float = struct.unpack(code, struct.pack(code, count))[0]
-    return held if held else None  # a float's zero: its sign is unknown
+    return held if held else None  # a zero may be the float 0.0 or -0.0, which are different words
 
 
 def _neighbours(raw: float, number_format: NumberFormat) -> Iterable[float]:
