@@ -126,15 +126,15 @@ MISTAKES = {
     "sqrt(current)": 'column 1: A has no square root; use as(x, "1") to leave the unit out',
     "min(current)": "column 1: min takes 2 values or more, not 1",
     'current + "A"': "column 11: a number is needed here, not a text",
-    "1 + 2": "column 1: the value never changes; name a register, such as output_current",
+    "1 + 2": "column 1: the value never changes; use a register, such as output_current",
     "integral(2) + current": "column 1: integral needs a value that changes, such as a register",
     "table(current, 1, 2, 3, 4)": 'column 1: table() takes a position, a unit and points: table(x, "m3/h", ',
     'table(current, "V", 1, 2, 1, 4)': "column 1: the positions of a table must ascend: 1, 1",
     'table(current, "V", 1, 2, status, 4)': "column 27: the points of a table must be numbers",
     'table(current, "V", 1, 2)': 'column 1: a table has two or more points: table(x, "unit", x1, y1, x2, y2)',
     "as(current)": 'column 1: as() takes a value and a unit: as(x, "kW")',
-    "1e999 * current": "column 1: 1e999 is too large",
-    "(" * 60 + "current" + ")" * 60: "column 41: more than 40 levels are nested; split it",
+    "1e999 * current": "column 1: the number 1e999 is too large",
+    "(" * 60 + "current" + ")" * 60: "column 41: the expression has more than 40 nested levels; split it",
     "current"
     + " " * MOST_CHARACTERS: f"column 1000: the expression has more than {MOST_CHARACTERS} characters",
 }

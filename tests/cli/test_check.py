@@ -67,9 +67,9 @@ def test_the_check_command_lists_unknown_facts_and_forbidden_writes(run: Run, fa
 
 
 def test_the_check_command_refuses_an_address_in_place_of_a_file(run: Run) -> None:
-    told = "http://10.0.0.7:8750 is an address, not a plant file; a gateway's page is for a browser: "
+    told = "http://10.0.0.7:8750 is a web address, not a plant file; open a gateway's page in a "
     for command in ("check", "plan", "poll", "simulate"):
-        assert run(command, "http://10.0.0.7:8750") == (2, "", f"multidrop: {told}open it there\n")
+        assert run(command, "http://10.0.0.7:8750") == (2, "", f"multidrop: {told}browser\n")
 
 
 def test_the_check_command_accepts_the_name_of_a_family_that_ships_as_a_file(run: Run) -> None:

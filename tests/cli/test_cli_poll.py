@@ -152,7 +152,10 @@ def test_the_commands_convert_and_report_ask_for_one_segment_file(run: Run, tmp_
         (["--rotate", "soon"], "invalid time 'soon': write 1 s to 100 years"),
         (["--most", "big"], "invalid size 'big': write 1 kB or more"),
         (["--trigger", "pump-1.output_current", *OUT], "--trigger pump-1.output_current: column 1: "),
-        (["--trigger", "output_current > 30", *OUT], "output_current has no drive; write it as pump-1."),
+        (
+            ["--trigger", "output_current > 30", *OUT],
+            "the name output_current needs a drive, such as pump-1.",
+        ),
         (["--trigger", "key"], "--trigger needs --out"),
         (["--trigger", "key", *OUT, "--rotate", "1 h"], "--trigger and --rotate exclude each other"),
         (["--trigger", "key", "--out", "a.txt"], "a.txt: a recording's name must end in .arrows"),

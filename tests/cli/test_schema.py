@@ -36,7 +36,7 @@ ROOT = Path(__file__).parents[2]
 LEAST = 0.95  # required share of refused files, among all invalid files
 
 NOT_STATED = {  # rules that JSON Schema cannot state, with patterns of the sentences that report them
-    "names and ports at several places differ": r"already (has this name|used)|this name too",
+    "names and ports at several places differ": r"already (has this name|used)|has the same name",
     "numbers at several places differ": r"are both|at the same address",
     "names differ not only in capitals": r"differ in capitals",
     "units of an expression agree": r"cannot be (combined|converted)",

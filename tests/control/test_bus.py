@@ -306,7 +306,7 @@ MISTAKES: dict[type[Exception], list[tuple[Callable[[Bus, Any], Any], str]]] = {
         ),
         (
             lambda bus, rig: PolledDrive(rig, "speed"),
-            "PolledDrive takes a list of registers, such as ['output_current'], not a single one",
+            "PolledDrive takes a list of registers, such as ['output_current'], not a single register",
         ),
     ],
 }

@@ -138,7 +138,7 @@ def test_a_ramp_needs_a_rate_if_the_drives_own_is_unusable(most: int, seconds: i
     line, drive, sim = ramped(Ramped)
     sim["maximum_frequency"], sim["acceleration_time"] = most, seconds
     with pytest.raises(
-        WriteForbidden, match="the acceleration of ramped@1 cannot be read: give a rate in Hz/s"
+        WriteForbidden, match="the acceleration of ramped@1 cannot be read: pass rate in Hz/s"
     ):
         ramp(drive, 2.0)
     assert line.written == []
@@ -376,7 +376,7 @@ def test_a_ramp_is_never_faster_than_the_drive_s_own_ramp() -> None:
 
 def test_a_ramp_without_a_known_acceleration_needs_a_rate() -> None:
     line, drive, _ = one(InvtCHE(1, maximum_frequency=50))
-    with pytest.raises(WriteForbidden, match="give a rate"):
+    with pytest.raises(WriteForbidden, match="pass rate"):
         ramp(drive, 20.0)
     ramp(drive, 2.0, rate=2.0)
     assert steps(line) == [200, 400]  # 1 Hz and 2 Hz, in 0.01 % of 50 Hz
@@ -471,7 +471,7 @@ class KeptToy(Toy):
     ("drive", "before", "rate", "error"),
     [
         (YD1000(1), 10, None, r"82\.50 Hz is above maximum_frequency, which is 80 Hz"),
-        (ShareToy(1), None, 5.0, "is in %: a ramp needs maximum_frequency, which is not declared"),
+        (ShareToy(1), None, 5.0, "is in %: for a ramp, declare maximum_frequency = HZ"),
         (Toy(1), None, 5.0, r"^toy@1 cannot report its setpoint: call set_frequency before a ramp$"),
         (DelixiModbus(1), None, None, "EEPROM"),
         (KeptToy(1), 5, 5.0, "which a ramp would wear out"),

@@ -49,29 +49,27 @@ WRONG: dict[str, dict[str, Any]] = {
         "number_format": NumberFormat.F32,
         "table": COIL,
     },
-    "number_format = U32_EITHER leaves the order of its words open": {
+    "number_format = U32_EITHER has no fixed word order, so the register cannot": {
         "number_format": NumberFormat.U32_EITHER
     },
     "offset = '-40' is not a number, such as -40": {"offset": "-40"},
     "offset = inf is not a number": {"offset": float("inf")},
     "order = 'DCAB' is not one of AB, BA, ABCD, CDAB, BADC, DCBA": {"order": "DCAB"},
-    "order = 'BA' is for one word, and this has 2: CDAB, BADC or DCBA": {
+    "order = 'BA' is for one word, not for 2: write CDAB, BADC or DCBA": {
         "order": "BA",
         "number_format": NumberFormat.U32,
     },
-    "order is for numbers in words, and a coil holds none": {"order": "CDAB", "table": COIL},
+    "order is only for 16-bit registers, and not for a coil": {"order": "CDAB", "table": COIL},
     "invalid = '7FFF' is not a tuple of at most 4 raw counts, such as (0x7FFF,)": {"invalid": "7FFF"},
     "invalid = (1, 2, 3, 4, 5) is not a tuple of at most 4 raw counts": {"invalid": (1, 2, 3, 4, 5)},
-    "invalid = 65536 is not a count of 16 bits": {"invalid": 65536},
-    "invalid = inf is not a count of 16 bits": {"invalid": float("inf")},
-    "invalid = 1.5 is not a count of 16 bits": {"invalid": 1.5},
-    "invalid = nan is for floats, and this is a whole number": {"invalid": float("nan")},
-    "a part is never written, as the other bits of its word would be too: declare a reading": {
+    "invalid = 65536 is not a raw count of 16 bits": {"invalid": 65536},
+    "invalid = inf is not a raw count of 16 bits": {"invalid": float("inf")},
+    "invalid = 1.5 is not a raw count of 16 bits": {"invalid": 1.5},
+    "invalid = nan is for floats, but the register holds a whole number": {"invalid": float("nan")},
+    "a part of a word cannot be written, because other bits would change: declare a reading": {
         "part": (0, 3)
     },
-    "number_format = I8 is one byte of a word, whose other byte is unknown": {
-        "number_format": NumberFormat.I8
-    },
+    "a register with number_format = I8 cannot be written": {"number_format": NumberFormat.I8},
     "its scale register exponent is not declared": {"scale_register": "exponent"},
     "span = (60, 0) is not the smallest and the largest value, such as (0, 50)": {"span": (60, 0)},
     "span = 60 is not the smallest and the largest value": {"span": 60},
@@ -88,11 +86,11 @@ WRONG: dict[str, dict[str, Any]] = {
     "never = True is not a text": {"never": True},
     "titles = {'de': 'Strom'} is not texts by ('ru', 'zh')": {"titles": {"de": "Strom"}},
     "while_running = 'no' is neither True nor False": {"while_running": "no"},
-    "its bound fastest is neither an option nor a number that can be read": {"at_most": "fastest"},
-    "function 15 cannot write a word: its table has 06H or 10H for it": {"table": Table("relay", 3, 0x0F)},
+    "its bound fastest is neither an option nor a register with a readable number": {"at_most": "fastest"},
+    "function 15 cannot write a word: write 06H or 10H": {"table": Table("relay", 3, 0x0F)},
     "function 101 cannot read a word": {"table": Table("fifo", 101, 0x10)},
     "ram_address = 65536 is not an address from 0 to FFFFH": {"ram_address": 0x10000},
-    "its ram_address is its own address, at which a write wears": {"ram_address": 5},
+    "its ram_address must differ from its address, where writes wear": {"ram_address": 5},
 }
 
 
@@ -106,23 +104,23 @@ PARTS: dict[str, dict[str, Any]] = {
     "part = (7, 4) is not the lowest and the highest bit, such as (0, 7)": {"part": (7, 4)},
     "part = (-1, 4) is not the lowest and the highest bit": {"part": (-1, 4)},
     "part = 3 is not the lowest and the highest bit, such as (0, 7)": {"part": 3},
-    "its part ends at bit 16, and its number has bits 0 to 15": {"part": (0, 16)},
+    "its part ends at bit 16, but its number has only bits 0 to 15": {"part": (0, 16)},
     "part is for whole numbers, not for number_format = F32": {
         "part": (0, 3),
         "number_format": NumberFormat.F32,
     },
-    "FAR is bit 17, and its number has bits 0 to 15": {"what": IntFlag("Bits", {"FAR": 1 << 17})},
-    "HIGH is bit 4, and its number has bits 0 to 3": {"what": IntFlag("Bits", {"HIGH": 16}), "part": (4, 7)},
+    "FAR is bit 17, but its register has 0 to 15": {"what": IntFlag("Bits", {"FAR": 1 << 17})},
+    "HIGH is bit 4, but its register has 0 to 3": {"what": IntFlag("Bits", {"HIGH": 16}), "part": (4, 7)},
     "LOW = -1 is not within 0 to 15, the raw counts of the register": {
         "what": IntEnum("Names", {"LOW": -1}),
         "part": (4, 7),
     },
-    "part is for numbers in words, and a coil holds none": {"part": (0, 0), "table": COIL},
-    "number_format = U32_EITHER leaves the order of its words open: leave out order and": {
+    "part is only for 16-bit registers, and not for a coil": {"part": (0, 0), "table": COIL},
+    "number_format = U32_EITHER has no fixed word order: remove order and": {
         "invalid": 1,
         "number_format": NumberFormat.U32_EITHER,
     },
-    "number_format = U32_EITHER leaves the order of its words open: leave out order and invalid": {
+    "number_format = U32_EITHER has no fixed word order: remove order and invalid": {
         "order": "CDAB",
         "number_format": NumberFormat.U32_EITHER,
     },
@@ -145,11 +143,14 @@ WRITTEN: dict[str, dict[str, Any]] = {
         "number_format": NumberFormat.I16,
     },
     "broadcast = 2 is not within 0 to 1, the raw counts": {"broadcast": (2,), "table": COIL},
-    "never_together = 0088H has no effect: only bits with names are checked": {"never_together": (0x88,)},
+    "never_together = 0088H has no effect on bits without names: name": {"never_together": (0x88,)},
     "never_together = 0009H has no effect": {"what": Run, "never_together": (9,)},
-    "never_together = 0H is not a mask of its bits": {"what": BITS, "never_together": (0,)},
-    "never_together = 10009H is not a mask of its bits": {"what": BITS, "never_together": (0x10009,)},
-    "its default cannot be: level = 70000 does not fit: the register holds 0 to 65535": {"default": 70000},
+    "never_together = 0H is not a mask of the register's bits": {"what": BITS, "never_together": (0,)},
+    "never_together = 10009H is not a mask of the register's bits": {
+        "what": BITS,
+        "never_together": (0x10009,),
+    },
+    "its default is not valid: level = 70000 does not fit: the register holds 0 to 65535": {"default": 70000},
 }
 
 
@@ -168,11 +169,13 @@ def test_declared_raw_counts_that_a_write_can_send_are_accepted() -> None:
 
 
 SCALED: dict[str, dict[str, Register[Any]]] = {
-    "its scale register power is not a readable I16: it holds a power of ten": {"power": reading(12)},
-    "its scale register power is not a plain count: it holds a power of ten": {
+    "its scale register power must be a readable I16, because it holds a power of ten": {
+        "power": reading(12)
+    },
+    "its scale register power must be a plain count, because it holds a power of ten": {
         "power": reading(12, number_format=NumberFormat.I16, step=0.1)
     },
-    "its scale register power is in another table: one request reads both": {
+    "its scale register power must be in the same table, because one request reads both": {
         "power": reading(12, number_format=NumberFormat.I16, table=INPUT)
     },
     "address 000BH between it and its scale register power is not declared": {
@@ -193,11 +196,11 @@ def test_a_scale_register_too_far_away_for_one_request_is_reported(mistake: str)
 def test_register_with_a_scale_register_must_be_a_read_only_number() -> None:
     power = reading(6, number_format=NumberFormat.I16)
     (sentence,) = mistakes_in(level=setting(5, scale_register="power"), power=power)
-    assert sentence.startswith("level: a register with a scale register is never written")
+    assert sentence.startswith("level: a register with a scale register cannot be written")
     (sentence,) = mistakes_in(
         level=reading(5, Run, scale_register="power"), power=reading(6, number_format=NumberFormat.I16)
     )
-    assert sentence == "level: a register with a scale register has neither names nor an offset"
+    assert sentence == "level: a register with a scale register cannot have names or an offset"
 
 
 def test_the_limit_of_registers_in_one_read_includes_the_scale_register() -> None:
@@ -242,7 +245,10 @@ def test_all_mistakes_in_a_drive_class_are_reported_together() -> None:
         *("speed", "level", "start", "registers", "address", "perform", "lost", "run", "run")
     ]
     assert mistakes[1] == "level: address FFFFH: its 2 words reach beyond FFFFH"
-    assert mistakes[2] == "start: reserved name; every drive has it for something else; rename the register"
+    assert (
+        mistakes[2]
+        == "start: reserved name: every drive has an attribute with this name; rename the register"
+    )
     assert mistakes[6] == "lost: address = '6' is not an address from 0 to FFFFH"
 
 
@@ -353,7 +359,7 @@ WRONG_FACTS: list[tuple[str, Any, str]] = [
     ("framings", ("rtu",), "framings = ('rtu',) is not a tuple of framings"),
     ("formats", ("8N1",), "formats = ('8N1',) is not a mapping, such as {Framing.RTU: "),
     ("formats", {Framing.RTU: ("8X1",)}, "formats = {<Framing.RTU: 0>: ('8X1',)} is not a mapping"),
-    ("formats", {Framing.ASCII: ("7N2",)}, "formats has none for rtu, its first framing"),
+    ("formats", {Framing.ASCII: ("7N2",)}, "formats has no list for rtu, the first framing"),
     ("exceptions", {1: 2}, "exceptions = {1: 2} is not a mapping of codes"),
     ("exceptions", {256: "x"}, "exceptions = {256: 'x'} is not a mapping of codes"),
     ("damaged", 17, "damaged = 17 is not a set of codes, such as frozenset({6})"),

@@ -99,7 +99,7 @@ verbs = ["pump-1.fly"]
         f"[serve]: tokens {tmp_path}/tokens: line 2 is not `name role sha256`; `multidrop serve --new-token` "
         "prints one",
         '[serve.may]: look = "everybody" is neither "anyone" nor "token"',
-        "[serve.may]: write: pump-1.output_current is never written: it can only be read",
+        "[serve.may]: write: pump-1.output_current is never written: the register can only be read",
         "[serve.may]: write: there is no drive 'pump-9'; did you mean pump-2 or pump-1?",
         "[serve.may]: write: 'setpoint' is not right; write write = [\"pump-1.frequency_setpoint\"]",
         "[serve.may]: write: pump-1.setpint: INVT CHE has no register 'setpint'; did you mean setpoint or "
@@ -195,7 +195,10 @@ def test_a_drive_name_with_a_star_is_not_read_as_a_pattern(tmp_path: Path) -> No
             "*.stop matches no register or verb: 'stop' of fan-1 cannot be allowed",
         ),
         ('verbs = ["Pump-*.start"]', "Pump-*.start matches no register or verb: there is no drive 'Pump-*'"),
-        ('write = ["*.output_current"]', "fan-1.output_current is never written: it can only be read"),
+        (
+            'write = ["*.output_current"]',
+            "fan-1.output_current is never written: the register can only be read",
+        ),
         ('write = ["*"]', "'*' is not right; write write = "),
         (
             'family.yd1000 = { verbs = ["start"] }',
@@ -310,7 +313,7 @@ def test_certificates_that_are_invalid_or_do_not_fit_their_key_are_reported(
         (
             'conditions = { a = "output_current > 30", b = "pump-1.outptu_current > 3" }',
             [
-                "output_current > 30: output_current has no drive; write it as pump-1.output_current",
+                "output_current > 30: the name output_current needs a drive, such as pump-1.output_current",
                 "pump-1.outptu_current > 3: column 1: ",
             ],
         ),

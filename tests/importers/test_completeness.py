@@ -328,7 +328,7 @@ def test_template_entries_without_required_keys_are_counted_with_reasons(bench: 
         "read": (whole, len(HELD) + 1),
     }
     lacking = {reason: (count, found) for reason, count, found in coverage.lacking()}
-    (part,) = [reason for reason in lacking if reason.startswith("is read, and not written: a part is")]
+    (part,) = [reason for reason in lacking if reason.startswith("is read, and not written: a part of")]
     assert lacking.pop(part) == (1, 1)
     assert lacking == {
         "its register type press_counter has no table": (3, 2),

@@ -261,7 +261,7 @@ def test_unit_ids_0_and_255_in_a_csv_table_are_valid_addresses(tmp_path: Path, u
 @table(
     ("text", "reason"),
     [
-        ("name,x\na,1\n", "no column is called address; the first line names the columns, and it is name, x"),
+        ("name,x\na,1\n", "no column is called address; the first line names these columns: name, x"),
         ("name,address\n", "has no row with an address"),
         ("name,address\na,\n", "a: its row has no address"),
         ("name,address,slave\na,1,900\n", "a: it cannot be read: slave = '900' is not a unit id"),

@@ -165,7 +165,7 @@ def test_esphome_package_without_controller_has_no_address(run: Run, tmp_path: P
     assert (device.title, device.address, list(entries(device))) == ("fast", None, ["volts"])
     source, family, plant = (tmp_path / name for name in ("package.yaml", "m.toml", "plant.toml"))
     status, _, err = run("import", source, "--out", family, "--plant", plant)
-    assert (status, "does not say the device's address" in err) == (2, True)
+    assert (status, "does not state its address" in err) == (2, True)
 
 
 @table(

@@ -231,7 +231,7 @@ def test_a_home_assistant_slave_above_247_is_imported_only_on_tcp(
     assert tomllib.loads(family.read_text())["family"]["addresses"] == [0, 255]
     assert run("plan", plant)[0] == 0
     source.write_text(f"modbus:\n  - {{{hub.replace('tcp, host: 10.0.0.5', 'serial, port: /dev/ttyS0')}}}\n")
-    with pytest.raises(ValueError, match=f"the address {unit} is a unit id of Modbus TCP, and the port"):
+    with pytest.raises(ValueError, match=f"its address {unit} is valid only on Modbus TCP, and its port"):
         plant_text(read_devices(source)[0], "m.toml")
 
 

@@ -146,7 +146,7 @@ def test_home_assistant_document_becomes_loadable_families(tmp_path: Path) -> No
     assert omissions(device) == [
         "Odd: its type custom has no number format",
         "Far_1: its address is not from 0 to 65535",
-        "Many: it cannot be read: virtual_count = 5000 is not 0 to 1000",
+        "Many: it cannot be read: virtual_count = 5000 is outside 0 to 1000",
         "Zone: a climate has no counterpart",
     ]
     text = family_text(device, "x")
@@ -317,11 +317,11 @@ def test_registers_above_the_limit_are_reported(tmp_path: Path, monkeypatch: pyt
         ("a.json", "[]", "is neither a wb-mqtt-serial template nor a SunSpec model: it is a list"),
         ("a.json", '{"a": {}}', "has no `device` with channels or parameters (wb-mqtt-serial)"),
         ("a.json", "{", "a.json: "),
-        ("a.json", '{"device": {"channels": 5}}', "is not a table of a supported program"),
+        ("a.json", '{"device": {"channels": 5}}', "is not a file of a supported program"),
         ("a.toml", "a = 1", "has no [[inputs.modbus]] (Telegraf): it has a"),
         ("a.toml", "[[inputs.modbus]]", "[[inputs.modbus]] has no field"),
         ("a.toml", "\na = ", "a.toml:2: the file is not TOML"),
-        ("a.xls", "a", "its suffix is not one of .csv"),
+        ("a.xls", "a", "the file's suffix is not one of .csv"),
     ],
 )
 def test_file_without_registers_is_refused(tmp_path: Path, name: str, text: str, expected: str) -> None:

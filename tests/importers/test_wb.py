@@ -238,7 +238,7 @@ def test_wb_mqtt_configuration_gives_a_device_for_each_slave(tmp_path: Path) -> 
             "a: it cannot be read: address = 'x' is no",
         ),
         ({"device": {"channels": [{"name": "a"}]}}, "a: it has no address"),
-        ({"device": {"channels": [{"address": 1, "word_order": "x"}]}}, "word_order = 'x' is none of"),
+        ({"device": {"channels": [{"address": 1, "word_order": "x"}]}}, "word_order = 'x' is not one of"),
     ],
 )
 def test_invalid_wb_mqtt_serial_document_raises_value_error_with_the_reason(

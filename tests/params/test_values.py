@@ -242,7 +242,7 @@ def test_backup_files_of_the_gd20_tool_are_loaded(tmp_path: Path, quote: str) ->
         ("a.toml", "", r"is not a parameter file: it has no \[parameters\]"),
         ("a.toml", '[[line]]\nname = "a"', "is a plant file, not a parameter file"),
         ("a.toml", "format = 2\n[parameters]\nA = 1", "has format 2, but this version of multidrop reads"),
-        ("a.toml", 'format = "x"\n[parameters]\nA = 1', "format = 'x' is not 1"),
+        ("a.toml", 'format = "x"\n[parameters]\nA = 1', "format = 'x' is not supported; write format = 1"),
         ("a.toml", "[parameters]\nA = 1.5", "A = 1.5 is not a raw count"),
         ("a.toml", "[parameters]", "has no parameters"),
         ("a.toml", "[parameters", r"a\.toml:1: the file is not TOML"),

@@ -582,8 +582,11 @@ def test_registers_that_must_be_read_together_are_read_first() -> None:
     ("details", "sentence"),
     [
         ({"read_together": (("a", "far"),)}, "between them are addresses that are not declared"),
-        ({"read_together": (("a", "b"),), "most_registers": {HOLDING: 1}}, "they take 2 addresses, and one"),
-        ({"read_together": (("a", "input_3"),)}, "these are in several"),
+        (
+            {"read_together": (("a", "b"),), "most_registers": {HOLDING: 1}},
+            "these registers span 2 addresses, but one",
+        ),
+        ({"read_together": (("a", "input_3"),)}, "these registers must be in one table"),
         ({"read_together": (("a", "none"),)}, "the name of a readable register"),
         ({"read_together": (("a", "run"),)}, "the name of a readable register"),
         ({"read_together": ("ab",)}, "not a tuple of groups"),

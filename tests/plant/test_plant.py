@@ -476,8 +476,8 @@ SCANNED = "is a port, not a plant file; `multidrop scan {} --out plant.toml` wri
 @table(
     ("name", "expected"),
     [
-        ("http://10.0.0.7:8750", "a gateway's page is for a browser"),
-        ("HTTPS://plant.example/", "a gateway's page is for a browser"),
+        ("http://10.0.0.7:8750", "open a gateway's page in a browser"),
+        ("HTTPS://plant.example/", "open a gateway's page in a browser"),
         ("nats://10.0.0.7:4222", "name a file such as plant.toml"),
         ("tcp://10.0.0.7", SCANNED.format("tcp://10.0.0.7")),
         ("/dev/ttyUSB0", SCANNED.format("/dev/ttyUSB0")),

@@ -467,7 +467,7 @@ def test_an_invalid_rate_changes_nothing(two: ClockedLines) -> None:
             "pump-1",
             "mystery",
             1.0,
-            "mystery of pump-1 is not polled; polled are: output_current, output_freq",
+            "mystery of pump-1 is not polled; its polled registers are: output_current, output_freq",
         ),
         ("pump-1", None, 0, "every = 0 is not a number of seconds from 0.0001 to 86400, or None"),
         ("pump-1", None, -1.0, "every = -1.0 is not"),

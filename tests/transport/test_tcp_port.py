@@ -174,7 +174,7 @@ def test_no_broadcast_is_sent_on_modbus_tcp() -> None:
             bus.attach(drive)
             bus.check_identity(drive)
         register = bus.drives[0].register("control")
-        with pytest.raises(WriteForbidden, match="cannot be broadcast over Modbus TCP"):
+        with pytest.raises(WriteForbidden, match="cannot be broadcast: Modbus TCP has no broadcast"):
             bus.broadcast(register, 0xC000)
         bus.stop_all(seconds=5)
     assert [sim.counters.broadcasts for sim in sims] == [0, 0]

@@ -147,7 +147,9 @@ class _ExpressionParser:
         """Parse an expression that has only operators with a precedence of at least `least`."""
         self._depth += 1
         if self._depth > MOST_DEPTH:
-            raise ExpressionError(self._token.column, f"more than {MOST_DEPTH} levels are nested; split it")
+            raise ExpressionError(
+                self._token.column, f"the expression has more than {MOST_DEPTH} nested levels; split it"
+            )
         self._operand()
         precedence = _PRECEDENCES.get(self._token.text, -1)
         while precedence >= max(least, 1):
@@ -166,7 +168,7 @@ class _ExpressionParser:
         if token.kind == "number":
             value = float(token.text)
             if not isfinite(value):
-                raise ExpressionError(token.column, f"{token.text} is too large")
+                raise ExpressionError(token.column, f"the number {token.text} is too large")
             self.steps.append(NumberStep(token.column, value))
         elif token.kind == "text":
             self.steps.append(TextStep(token.column, token.text[1:-1]))
@@ -210,7 +212,9 @@ class _ExpressionParser:
             if count:
                 self._next()
             if count == MOST_ARGUMENTS:
-                raise ExpressionError(self._token.column, f"more than {MOST_ARGUMENTS} arguments")
+                raise ExpressionError(
+                    self._token.column, f"the call has more than {MOST_ARGUMENTS} arguments"
+                )
             self._expression(0)
             count += 1
         self._expect(")")

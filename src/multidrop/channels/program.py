@@ -145,7 +145,7 @@ class SeriesTable:
             return self.slots[drive, reference.name]
         column, name = reference.column, reference.name
         if not drive:
-            raise ExpressionError(column, f"{name} has no drive; write it as pump-1.{name}")
+            raise ExpressionError(column, f"the name {name} needs a drive, such as pump-1.{name}")
         if drive not in self.drives:
             hint = did_you_mean(drive, self.drives, "write spaces around a minus sign")
             raise ExpressionError(column, f"there is no drive {drive!r}; {hint}")
@@ -178,7 +178,7 @@ class Program:
         if result.text is not None:
             raise ExpressionError(result.column, "a number is needed here, not a text")
         if not result.slots:
-            raise ExpressionError(1, "the value never changes; name a register, such as output_current")
+            raise ExpressionError(1, "the value never changes; use a register, such as output_current")
         self.slots = result.slots
         self.hold_s = max((series.holds_s[slot] for slot in self.slots), default=0.0)
         for memory in self.memories:

@@ -174,7 +174,7 @@ class IdentityCheck:
         except DriveException as refusal:
             kind = drive.title or type(drive).__name__
             raise WriteForbidden(
-                f"nothing is written to {drive.name}: it refuses a read that every {kind} answers "
+                f"nothing is written to {drive.name}: the drive refuses a read that every {kind} answers "
                 f"({refusal})",
                 rule="it does not answer like its family",
             ) from refusal

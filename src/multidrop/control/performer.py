@@ -299,15 +299,15 @@ class Broadcaster:
             register = drives[0].register(register)
         if drives and drives[0].framing is Framing.TCP:
             raise WriteForbidden(
-                f"{register.name} cannot be broadcast over Modbus TCP: there, unit id 0 is not a broadcast, "
-                f"but the gateway or the device itself; write to one drive after another",
+                f"{register.name} cannot be broadcast: Modbus TCP has no broadcast. Write to one drive after "
+                "another",
                 register=register.name,
                 rule="Modbus TCP has no broadcast",
             )
         if not _are_alike(drives):
             raise WriteForbidden(
                 f"{register.name} cannot be broadcast: the drives on this line differ in family or "
-                f"settings, so an address may be another register on each; write to one drive after another",
+                "settings, so an address may be different registers. Write to one drive after another",
                 register=register.name,
                 rule="the drives on the line differ",
             )

@@ -158,7 +158,7 @@ def checked_rate(drive: Drive, rate: float | None) -> Script[float]:
     """
     own = yield from _own_rate(drive)
     if rate is None and own is None:
-        raise WriteForbidden(f"the acceleration of {drive.name} cannot be read: give a rate in Hz/s")
+        raise WriteForbidden(f"the acceleration of {drive.name} cannot be read: pass rate in Hz/s")
     if rate is not None and not rate > 0:
         raise ValueError(f"rate = {rate:g} Hz/s is not above 0")
     if rate is not None and own is not None and rate > own:
@@ -208,6 +208,6 @@ def _present(drive: Drive, register: Register[float]) -> Script[float]:
     most = drive.option.get("maximum_frequency")
     if most is None:
         raise WriteForbidden(
-            f"{register.name} of {drive.name} is in %: a ramp needs maximum_frequency, which is not declared"
+            f"{register.name} of {drive.name} is in %: for a ramp, declare maximum_frequency = HZ"
         )
     return held * most / 100

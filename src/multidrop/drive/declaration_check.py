@@ -25,7 +25,7 @@ UNIT_IDS = range(256)  # unit ids on Modbus TCP; a serial line has fewer address
 EXCEPTION_CODES = range(1, 256)
 # Maps the function code that writes one coil or register to the code that writes several.
 _SAME_SPACE = {0x05: 0x0F, 0x06: 0x10}
-_TAKEN = "reserved name; every drive has it for something else"
+_TAKEN = "reserved name: every drive has an attribute with this name"
 
 # For each attribute of a register: its name, a function that checks the value, and the end of the error
 # sentence, which starts with "NAME = VALUE".
@@ -173,7 +173,7 @@ def fact_errors(family: Any) -> list[str]:
     wrong = _wrong_facts(family, _CLASS_RULES)
     is_known = not wrong.keys() & {"formats", "framings"}
     if is_known and family.formats and (first := family.framings[0]) not in family.formats:
-        wrong["formats"] = f"formats has none for {first}, its first framing"
+        wrong["formats"] = f"formats has no list for {first}, the first framing"
     if "options" not in wrong:
         for name, option in family.options.items():
             if not isinstance(name, str) or not isinstance(option, Option):
@@ -275,7 +275,7 @@ def _errors_together(
     for name in filter(None, (register.at_least, register.at_most)):
         other = registers.get(name)
         if name not in bounds and (other is None or not other.readable or other.values is not None):
-            yield f"its bound {name} is neither an option nor a number that can be read"
+            yield f"its bound {name} is neither an option nor a register with a readable number"
 
 
 # Function codes that read bits or 16-bit words, and codes that write them (application protocol V1.1b3, 6).
@@ -291,14 +291,14 @@ def _table_errors(register: Register[Any]) -> Iterator[str]:
     for verb, code, known in (("read", table.read, _READS), ("write", table.write, _WRITES)):
         if code is not None and table.carrier in known and code not in known[table.carrier]:
             codes = " or ".join(f"{each:02X}H" for each in known[table.carrier])
-            yield f"function {code!r} cannot {verb} a {table.carrier.value}: its table has {codes} for it"
+            yield f"function {code!r} cannot {verb} a {table.carrier.value}: write {codes}"
     name = f"an {table.name}" if table.name[0] in "aeiou" else f"a {table.name}"
     if access is not Access.COMMAND and table.read is None:
         yield f"{name} cannot be read, so it cannot hold a {access.value}"
     if access is not Access.READING and table.write is None and not register.never:
         yield f"{name} cannot be written, so it cannot hold a {access.value}"
     if access is Access.READING and (register.harmless or register.broadcast or register.moves):
-        yield "a reading is never written: leave out harmless, broadcast and moves"
+        yield "a reading is never written: remove harmless, broadcast and moves"
 
 
 def _fits_table(register: Register[Any]) -> bool:
@@ -326,31 +326,31 @@ def _number_errors(register: Register[Any]) -> Iterator[str]:
         if at is not None and at + register.words - 1 > LAST_ADDRESS:
             yield f"{name} {at:04X}H: its {register.words} words reach beyond FFFFH"
     if register.ram_address == register.address:
-        yield "its ram_address is its own address, at which a write wears the EEPROM"
+        yield "its ram_address must differ from its address, where writes wear the EEPROM"
     if register.table.carrier is not Carrier.WORD:
         for name, common in _OF_WORDS.items():
             if getattr(register, name) != common:
-                yield f"{name} is for numbers in words, and a {register.table.name} holds none"
+                yield f"{name} is only for 16-bit registers, and not for a {register.table.name}"
         return
     if register.is_float and register.values is not None:
         names = register.values.__name__
         yield f"number_format = {number_format.name} is for decimal numbers, but {names} names whole numbers"
     if register.order == "BA" and register.words > 1:
-        yield f"order = 'BA' is for one word, and this has {register.words}: CDAB, BADC or DCBA"
+        yield f"order = 'BA' is for one word, not for {register.words}: write CDAB, BADC or DCBA"
     if number_format is NumberFormat.I8 and not is_reading:
-        yield "number_format = I8 is one byte of a word, whose other byte is unknown: it is never written"
+        yield "a register with number_format = I8 cannot be written: the other byte of its word is unknown"
     if number_format is NumberFormat.U32_EITHER and (register.order != "ABCD" or register.invalid):
-        yield "number_format = U32_EITHER leaves the order of its words open: leave out order and invalid"
+        yield "number_format = U32_EITHER has no fixed word order: remove order and invalid"
     if number_format is NumberFormat.U32_EITHER and register.writable:
-        yield "number_format = U32_EITHER leaves the order of its words open: it is never written"
+        yield "number_format = U32_EITHER has no fixed word order, so the register cannot be written"
     if register.part is not None:
         if number_format not in _PARTED:
             yield f"part is for whole numbers, not for number_format = {number_format.name}"
         elif register.part[1] >= width(number_format):
             bits = width(number_format) - 1
-            yield f"its part ends at bit {register.part[1]}, and its number has bits 0 to {bits}"
+            yield f"its part ends at bit {register.part[1]}, but its number has only bits 0 to {bits}"
         if not is_reading:
-            yield "a part is never written, as the other bits of its word would be too: declare a reading"
+            yield "a part of a word cannot be written, because other bits would change: declare a reading"
     yield from _invalid_errors(register)
     yield from _name_errors(register)
 
@@ -376,16 +376,16 @@ def _written_errors(register: Register[Any]) -> Iterator[str]:
                 yield f"{key} = {count} is not within {least} to {most}, the raw counts of the register"
     for mask in register.never_together:
         if not _is_flags(register):
-            yield f"never_together = {mask:04X}H has no effect: only bits with names are checked; name them"
+            yield f"never_together = {mask:04X}H has no effect on bits without names: name the bits"
         elif not 0 < mask <= most:
-            yield f"never_together = {mask:X}H is not a mask of its bits"
+            yield f"never_together = {mask:X}H is not a mask of the register's bits"
     if register.values is not None:
         return
     lowest, highest = register.span or (-math.inf, math.inf)
     if register.default is not None and not lowest <= register.default <= highest:
         yield f"default = {register.default:g} is outside its span of {lowest:g} to {highest:g}"
     elif register.default is not None and (mistake := _encode_error(register, register.default)):
-        yield f"its default cannot be: {mistake}"
+        yield f"its default is not valid: {mistake}"
     for end in register.span if register.span is not None and register.writable else ():
         if mistake := _encode_error(register, end):
             yield f"an end of its span cannot be written: {mistake}"
@@ -405,9 +405,9 @@ def _invalid_errors(register: Register[Any]) -> Iterator[str]:
     bits = width(register.number_format)
     for count in register.invalid:
         if count != count:
-            yield "invalid = nan is for floats, and this is a whole number"
+            yield "invalid = nan is for floats, but the register holds a whole number"
         elif not -(1 << bits - 1) <= count < 1 << bits or count != int(count):
-            yield f"invalid = {count:g} is not a count of {bits} bits"
+            yield f"invalid = {count:g} is not a raw count of {bits} bits"
 
 
 def _name_errors(register: Register[Any]) -> Iterator[str]:
@@ -420,7 +420,7 @@ def _name_errors(register: Register[Any]) -> Iterator[str]:
             continue
         if _is_flags(register) and member.value > 0 and member.value.bit_count() == 1:
             last = register.coding.mask.bit_count() - 1
-            yield f"{member.name} is bit {member.value.bit_length() - 1}, and its number has bits 0 to {last}"
+            yield f"{member.name} is bit {member.value.bit_length() - 1}, but its register has 0 to {last}"
         else:
             span = f"{least} to {most}, the raw counts of the register"
             yield f"{member.name} = {member.value} is not within {span}"
@@ -533,17 +533,17 @@ def _tie_errors(register: Register[Any], registers: Mapping[str, Register[Any]])
         yield f"its scale register {register.scale_register} is not declared"
         return
     if scale.number_format is not NumberFormat.I16 or not scale.readable:
-        yield f"its scale register {scale.name} is not a readable I16: it holds a power of ten"
+        yield f"its scale register {scale.name} must be a readable I16, because it holds a power of ten"
     elif scale.part or scale.offset or scale.step != 1 or scale.scale_register or scale.values:
-        yield f"its scale register {scale.name} is not a plain count: it holds a power of ten"
+        yield f"its scale register {scale.name} must be a plain count, because it holds a power of ten"
     if scale.table.read_space != register.table.read_space:
-        yield f"its scale register {scale.name} is in another table: one request reads both"
+        yield f"its scale register {scale.name} must be in the same table, because one request reads both"
     if register.access is not Access.READING:
-        yield "a register with a scale register is never written: the device may change the scale"
+        yield "a register with a scale register cannot be written: the device may change the scale"
     if register.values is not None or register.offset:
-        yield "a register with a scale register has neither names nor an offset"
+        yield "a register with a scale register cannot have names or an offset"
     if register.scaled_by not in (None, scale):
-        yield f"its scale register {scale.name} was declared again: declare this one again as well"
+        yield f"its scale register {scale.name} was declared again: also declare this register again"
 
 
 def _reach_errors(register: Register[Any], family: Any) -> Iterator[str]:
@@ -583,13 +583,13 @@ def _group_errors(family: Any, group: Collection[Any], seen: Collection[str]) ->
         yield f"{shown}: {', '.join(sorted(again))} is in another group too; merge the two groups"
     table = registers[0].table
     if any(register.table.read_space != table.read_space for register in registers):
-        yield f"{shown}: one request reads one table, and these are in several"
+        yield f"{shown}: these registers must be in one table, because one request reads them"
         return
     start = min(register.reach.start for register in registers)
     stop = max(register.reach.stop for register in registers)
     longest, limit = max(len(register.reach) for register in registers), read_limit(family, table)
     if stop - start > max(limit, longest):
-        yield f"{shown}: they take {stop - start} addresses, and one request reads {limit} at most"
+        yield f"{shown}: these registers span {stop - start} addresses, but one request reads at most {limit}"
     elif not may_be_crossed(family, table, range(start, stop)):
         yield (
             f"{shown}: between them are addresses that are not declared; "

@@ -40,7 +40,9 @@ def read_devices(path: Path) -> list[ImportedDevice]:
         lost = sorted((lost for device in devices for lost in device.lost), key=lambda one: not one.is_entry)
         reasons = "; ".join(printable(str(one))[:200] for one in lost[:MOST_REASONS])
         more = f"; and {len(lost) - MOST_REASONS} more" if len(lost) > MOST_REASONS else ""
-        raise ValueError(f"{path} has no register that can be imported: {reasons or 'it is empty'}{more}")
+        raise ValueError(
+            f"{path} has no register that can be imported: {reasons or 'the file is empty'}{more}"
+        )
     _make_titles_unique(found, path.stem)
     return found
 
@@ -66,17 +68,19 @@ def all_devices(path: Path) -> list[ImportedDevice]:
     """
     read = _READERS.get(path.suffix.lower())
     if read is None:
-        raise ValueError(f"{path}: its suffix is not one of {', '.join(_READERS)}")
+        raise ValueError(f"{path}: the file's suffix is not one of {', '.join(_READERS)}")
     try:
         devices = read(read_bounded(path, MOST_BYTES, "file"), path)
         for device in devices:
             drop_undeclarable(device)
     except KeyError as missing:
         key = printable(str(missing.args[0]))[:200]
-        raise ValueError(f"{path} is not a table of a supported program: {key} is missing") from missing
+        raise ValueError(
+            f"{path} is not a file of a supported program: the key or column {key} is missing"
+        ) from missing
     except (AttributeError, TypeError, IndexError, OverflowError, RecursionError) as failure:
         kind = f"{type(failure).__name__} {printable(str(failure))[:200]}"
-        raise ValueError(f"{path} is not a table of a supported program: {kind}") from failure
+        raise ValueError(f"{path} is not a file of a supported program: {kind}") from failure
     except DocumentError as mistake:
         raise ValueError(printable(mistake.in_file(path))) from mistake
     except ValueError as mistake:

@@ -178,8 +178,7 @@ class _Layout:
         self._at = _places([name for name, _ in header])
         if "at" not in self._at:
             shown = ", ".join(cell.strip()[:20] for cell in rows[0][:8])
-            line = "the first line names the columns"
-            raise ValueError(f"no column is called address; {line}, and it is {shown}")
+            raise ValueError(f"no column is called address; the first line names these columns: {shown}")
         place = self._at["at"]
         self._length = header[self._at["length"]][0] if "length" in self._at else ""
         self._is_hex = header[place][1] == "hex"

@@ -366,15 +366,17 @@ def plant_text(device: ImportedDevice, family_file: str) -> str:
     """
     if not device.registers:
         raise ValueError(
-            "the device has only text registers, which are never polled: no plant file can be made of it"
+            "no plant file can be made of this device: it has only text registers, which are never polled"
         )
     if device.address is None:
-        raise ValueError("the file does not say the device's address: no plant file can be made of it")
+        raise ValueError(
+            "no plant file can be made of this device, because the file does not state its address"
+        )
     is_serial = device.address in SERIAL_ADDRESSES
     if not is_serial and device.line.port and not device.line.is_network:
         raise ValueError(
-            f"the address {device.address} is a unit id of Modbus TCP, and the port {device.line.port} is a "
-            "serial one: no plant file can be made of it"
+            f"no plant file can be made of this device: its address {device.address} is valid only on Modbus "
+            f"TCP, and its port {device.line.port} is serial"
         )
     port = device.line.port or ("/dev/ttyUSB0" if is_serial else f"tcp://{UNKNOWN_HOST}:502")
     return "\n".join(
@@ -497,7 +499,7 @@ def _drop_conflicts(device: ImportedDevice, held: dict[str, Register[Any]]) -> N
     while wrong := _conflicts({**held, "readable_gaps": gaps}):
         named = {name: sentence for name, sentence in wrong.items() if name in by_name}
         if not named:
-            raise ValueError(f"its registers cannot form one family: {'; '.join(wrong.values())}")
+            raise ValueError(f"the file's registers cannot form one family: {'; '.join(wrong.values())}")
         for name, sentence in named.items():
             found = by_name[name]
             if found.details.pop("scale_register", None):

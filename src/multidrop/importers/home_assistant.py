@@ -248,7 +248,7 @@ def _verify(register: ImportedRegister, entry: Mapping[str, Any]) -> None:
         written, table = register.address, str(verify.get("input_type", register.table))
         register.address = whole(verify, "address", written)
         if table not in _TABLES:
-            raise ValueError(f"verify: its input_type {table[:40]!r} is not a known table")
+            raise ValueError(f"verify: input_type = {table[:40]!r} is not a known table")
         register.table = _TABLES[table]
         if register.address != written:
             register.gaps.append(f"it is written at another address, {written:04X}H")
@@ -326,7 +326,7 @@ def _more(entry: Mapping[str, Any]) -> int:
     key = "slave_count" if entry.get("slave_count") else "virtual_count"
     more = whole(entry, key, 0)
     if not 0 <= more <= MOST_REPEATED:
-        raise ValueError(f"{key} = {more} is not 0 to {MOST_REPEATED}")
+        raise ValueError(f"{key} = {more} is outside 0 to {MOST_REPEATED}")
     return more
 
 

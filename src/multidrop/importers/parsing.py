@@ -149,7 +149,7 @@ def parse_yaml(text: str) -> Any:
     try:
         yaml: Any = import_module("yaml")
     except ImportError as failure:
-        raise ImportError(f"YAML is read with PyYAML: {install_command('yaml')}") from failure
+        raise ImportError(f"reading YAML needs PyYAML; install it: {install_command('yaml')}") from failure
     if len(text) > MOST_CHARACTERS:
         raise ValueError(f"the file has more than {MOST_CHARACTERS} characters of YAML")
 

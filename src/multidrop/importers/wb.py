@@ -386,5 +386,5 @@ def _place(address: Any) -> tuple[int, tuple[int, int] | None]:
 def _is_little(entry: Mapping[str, Any], key: str) -> bool:
     given = str(entry.get(key, "big_endian"))
     if given not in _ORDERS:
-        raise ValueError(f"{key} = {given[:40]!r} is none of {', '.join(_ORDERS)}")
+        raise ValueError(f"{key} = {given[:40]!r} is not one of {', '.join(_ORDERS)}")
     return _ORDERS[given]

@@ -127,10 +127,10 @@ def _check_also(family: Any, also: Collection[str], given: ParameterSet) -> None
         if not parameter_of(family, code).is_line:
             raise ValueError(
                 f"--also {code}: {code} is not the drive's address, baud rate, format or protocol; "
-                "only those need --also"
+                "only these parameters need --also"
             )
         if code not in given.values:
-            raise ValueError(f"--also {code}: {given.source} has no {code}")
+            raise ValueError(f"--also {code}: {given.source} has no parameter {code}")
 
 
 def _notes(given: ParameterSet, present: ParameterSet) -> tuple[str, ...]:
@@ -174,8 +174,8 @@ def _check_no_run_command(drive: Drive) -> None:
     if source is not None and line is not None and (held := drive.read(source)) != line:
         raise WriteForbidden(
             f"nothing is written to {drive.name}: its {source.name} ({source.place}) is "
-            f"{source.format(held)}, so its panel or a terminal may start the motor while parameters change; "
-            f"set it to {int(line)} (the line) on the panel first"
+            f"{source.format(held)}, so the panel or a terminal may start the motor. First set "
+            f"{source.name} to {int(line)} (the line) on the panel"
         )
 
 

@@ -103,7 +103,7 @@ def _from_toml(data: bytes) -> tuple[dict[str, str], dict[str, int]]:
     document = parse_document(data)
     if "line" in document:
         raise ValueError(
-            "this is a plant file, not a parameter file; name a drive of it, as PLANT.toml DRIVE"
+            "this is a plant file, not a parameter file; to name one of its drives, write PLANT.toml DRIVE"
         )
     values = document.get("parameters")
     if not isinstance(values, dict):
@@ -120,7 +120,7 @@ def _check_format(given: object) -> None:
             "use a newer version"
         )
     if given not in (None, FORMAT):
-        raise ValueError(f"format = {given!r} is not {FORMAT}")
+        raise ValueError(f"format = {given!r} is not supported; write format = {FORMAT}")
 
 
 def _raw(code: str, raw: object) -> int:
@@ -165,14 +165,14 @@ def _from_csv(data: bytes) -> tuple[dict[str, str], dict[str, int]]:
         facts = {"model": GD20_MODEL, **facts}
     elif not {"code", "raw"} <= {*names}:
         if GD20_COLUMNS - {"valor_parametro"} <= {*names}:
-            raise ValueError("the file lists parameters without values; pass the PC tool's backup")
+            raise ValueError("the file lists parameters without values; give a backup file of the PC tool")
         raise ValueError("this is not a parameter file: its first row does not name the columns code and raw")
     found: dict[str, int] = {}
     try:
         for row in rows:
             code = _gd20_code(row, names) if is_gd20 else (row[names["code"]] or "").strip()
             if code in found:
-                raise ValueError(f"{code} is given twice")
+                raise ValueError(f"the parameter {code} is given twice")
             found[code] = _raw(code, _whole(row[names["valor_parametro" if is_gd20 else "raw"]]))
     except csv.Error as failure:
         raise ValueError(f"the file is not CSV: {failure}") from failure

@@ -55,7 +55,7 @@ def parameter_of(family: Any, code: str) -> Parameter:
     if code not in known:
         first = next(iter(known))
         raise ValueError(
-            f"{family.model or family.__name__} has no parameter {code}; the first one is {first}"
+            f"{family.model or family.__name__} has no parameter {code}; its first parameter is {first}"
         )
     return known[code]
 

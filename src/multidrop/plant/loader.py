@@ -100,7 +100,7 @@ def _tables(document: dict[str, Any], keys: Mapping[str, Key], place: TomlPlace)
     return place.check({name: one for name, one in document.items() if name not in _INNER}, keys)
 
 
-_FAMILY_FILE = "this is a family file, not a plant file; name it as the model of a drive in a plant file"
+_FAMILY_FILE = "this is a family file, not a plant file; name it in a plant file, as the model of a drive"
 _INNER = {"drive": "[[line.drive]]", "channel": "[[line.drive.channel]]"}
 
 
@@ -117,7 +117,7 @@ def port_or_address(name: Path | str) -> str:
         return ""
     shown = f"{url[1]}://{url[2]}" if url else str(name)
     if url and url[1].lower() in ("http", "https"):
-        return f"{shown} is an address, not a plant file; a gateway's page is for a browser: open it there"
+        return f"{shown} is a web address, not a plant file; open a gateway's page in a browser"
     if url and url[1].lower() not in _PORTS:
         return f"{shown} is an address, not a plant file; name a file such as plant.toml"
     return f"{shown} is a port, not a plant file; `multidrop scan {shown} --out plant.toml` writes one"

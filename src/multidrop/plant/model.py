@@ -95,7 +95,7 @@ class PolledDrive:
             raise TypeError(f"PolledDrive takes a drive such as YD1000(1), not {drive!r}")
         if isinstance(polls, (str, Register, Polled)):
             raise TypeError(
-                "PolledDrive takes a list of registers, such as ['output_current'], not a single one"
+                "PolledDrive takes a list of registers, such as ['output_current'], not a single register"
             )
         wanted = drive.readings() if polls is None else polls
         object.__setattr__(self, "drive", drive)
@@ -117,7 +117,9 @@ class PolledDrive:
         """
         if register is not None and register not in [poll.register for poll in self.polls]:
             names = ", ".join(poll.register.name for poll in self.polls) or "nothing"
-            raise ValueError(f"{register.name} of {self.drive.name} is not polled; polled are: {names}")
+            raise ValueError(
+                f"{register.name} of {self.drive.name} is not polled; its polled registers are: {names}"
+            )
         polls = [
             Polled(poll.register, every) if register in (None, poll.register) else poll for poll in self.polls
         ]
@@ -232,7 +234,9 @@ class Plant:
         owners: dict[str, str] = {}
         for line in lines:
             if line.port in owners:
-                raise ValueError(f"lines {owners[line.port]} and {line.name} would both use {line.port}")
+                raise ValueError(
+                    f"lines {owners[line.port]} and {line.name} would both use {line.port}; give each its own"
+                )
             owners[line.port] = line.name
         return replace(self, lines=lines)
 
@@ -376,7 +380,9 @@ def _entry(key: str, drive: Drive, name: object) -> str:
         except ValueError as unknown:
             raise ValueError(f"{key}: {entry}: {unknown}") from None
         if not register.writable:
-            raise ValueError(f"{key}: {entry} is never written: {register.never or 'it can only be read'}")
+            raise ValueError(
+                f"{key}: {entry} is never written: {register.never or 'the register can only be read'}"
+            )
         return entry
     verbs = [verb for verb in verbs_of(drive) if verb in LISTED_VERBS]
     if name not in verbs:
@@ -464,7 +470,7 @@ def with_triggers(plant: Plant, conditions: Collection[str]) -> TriggerChannels:
             own = {drive: f"fault of {drive}" for drive in by_fault}
             signals |= {text: _polled_series(plant, drive) for drive, text in own.items()}
         elif bare := next((name for drive, name in _references(condition) if not drive and names[1:]), ""):
-            mistakes[condition] = f"{bare} has no drive; write it as {names[0]}.{bare}"
+            mistakes[condition] = f"the name {bare} needs a drive, such as {names[0]}.{bare}"
         else:
             signals[condition] = [(drive or names[0], name) for drive, name in _references(condition)]
         plant = _with_channel(plant, channel, own)

@@ -188,18 +188,18 @@ TWENTY_MISTAKES = [
     "twenty.toml:3: [family]: unknown key 'manuel'; did you mean manual?",
     "twenty.toml:8: [family]: silence = 'soon' is not a duration from 100 us to 24 h, such as \"50 ms\", "
     '"2 s" or "1 min"',
-    "twenty.toml:6: [family]: addresses = [1, 300]: a range is its first and its last address, from 1 to "
+    "twenty.toml:6: [family]: addresses = [1, 300]: a range has a first and a last address from 1 to "
     "247 (0 to 255 on Modbus TCP); write addresses = [1, 247]",
     "twenty.toml:4: [family]: baudrates = [9600, 'fast']: 'fast' is not a baud rate; "
     "write baudrates = [9600, 19200]",
-    "twenty.toml:7: [family]: together: holding = 200 is not 1 to 125 registers in one read",
-    'twenty.toml:5: [family]: formats has "7E1", and an RTU frame needs 8 data bits; write "8E1"',
+    "twenty.toml:7: [family]: together: holding = 200 is not a number of registers from 1 to 125",
+    'twenty.toml:5: [family]: formats has "7E1", but an RTU frame needs 8 data bits; write "8E1"',
     "twenty.toml:12: [default]: unknown key 'tabel'; did you mean table?",
     "twenty.toml:15: [reading] speed 1: 'speed 1' cannot be a register's name: it is not letters of a to z, "
     "digits and _, after a letter; write speed_1",
     "twenty.toml:16: [reading] speed: unknown key 'stepp'; did you mean step?",
     'twenty.toml:17: [reading] voltage: at: "40001" begins with 4, which stands for table holding, but '
-    'table = "input"; leave out table, or write a number of table input',
+    'table = "input"; remove the key table, or write an address of table input',
     "twenty.toml:18: [reading] level: at: 40002 may be the number 40002, or register 2 of table holding; "
     'write "9C42H" for that number, or "40002" in quotes in the TOML file (in a CSV file without '
     "counts_from) for that of the table",
@@ -218,9 +218,10 @@ TWENTY_MISTAKES = [
     "twenty.csv: line 2, an: at: 1E10 is a power of ten, into which a spreadsheet has converted a hex "
     "number; write 1E10H",
     "twenty.csv: line 3, column access: 'readings' is not known; write reading, setting, command",
-    "twenty.toml:1: [family]: 'counts_from' is missing, and 16 is a number; add counts_from = 0 where the "
-    "manual's numbers are sent as they are, or 1 where its register 1 is sent as 0",
-    "twenty.toml:26: [setting] target: its bound limitt is neither an option nor a number that can be read",
+    "twenty.toml:1: [family]: 'counts_from' is missing, so the number 16 is ambiguous. Add counts_from = 0 "
+    "if the manual's numbers are sent unchanged, or 1 if its register 1 is sent as 0",
+    "twenty.toml:26: [setting] target: its bound limitt is neither an option nor a register with a readable "
+    "number",
 ]
 
 
@@ -239,8 +240,8 @@ def test_more_than_twenty_mistakes_in_a_family_file_are_reported_together(tmp_pa
 PROVING_NOTHING = {
     "above = -1": "every value is accepted",
     "above = -inf": "every value is accepted",
-    "above = 5\nbelow = 3": "no value is above and below these limits",
-    "below = nan": "no value is above and below these limits",
+    "above = 5\nbelow = 3": "no value of the register is within these limits",
+    "below = nan": "no value of the register is within these limits",
     "is = [70000]": "is = [70000] has no value that the register can hold within the limits",
 }
 DEVICE = HEAD + "[reading]\ndevice = { at = 3 }\nspeed = { at = 4, unit = 'Hz', step = 0.1 }\n"
@@ -253,11 +254,11 @@ DEVICE = HEAD + "[reading]\ndevice = { at = 3 }\nspeed = { at = 4, unit = 'Hz', 
         ('[identify]\nregister = "device"\nis = [0x10A]', []),
         (
             '[[identify]]\nregister = "devise"\nis = [1]',
-            ["identify number 1: register = 'devise' is not a readable register of this file"],
+            ["identify number 1: register = 'devise' is not the name of a readable register in this file"],
         ),
         (
             '[[identify]]\nregister = "device"',
-            ["identify number 1: says no value; add is = [0x010A], or above and below"],
+            ["identify number 1: has no expected value; add is = [0x010A], or the keys above and below"],
         ),
         (
             '[[identify]]\nregister = "device"\nis = ["x"]',
@@ -278,7 +279,7 @@ DEVICE = HEAD + "[reading]\ndevice = { at = 3 }\nspeed = { at = 4, unit = 'Hz', 
         ("identify = 5", ["identify number 1: 5 is not a table with register, is, above, below"]),
         (
             "[verb.stop]\nsteps = []",
-            ["[verb] is not supported; name a profile, or write the drive as a Python class"],
+            ["[verb] is not supported; add profile to [family], or write the drive as a Python class"],
         ),
     ],
 )
@@ -303,7 +304,7 @@ WRONG_KEYS = [  # each text has one wrong key of a register
     ("values = {}", "values is empty; leave it out"),
     (
         "title.de = 'Strom'",
-        "title = {'de': 'Strom'}: it has the unknown language de, not one of ru, zh; write title.ru",
+        "title = {'de': 'Strom'}: the language de is unknown, not one of ru, zh; write title.ru",
     ),
     ("title = 'ток'", "title = 'ток': the value is not a table of titles by language"),
     ("title.ru = ''", "has a title of 0 characters, not 1 to 100"),
@@ -314,25 +315,25 @@ WRONG_SECTIONS = [  # each text is a wrong section before a valid section [readi
     ("[option]\nx = { span = [2, 1], meaning = 'm' }", "span = [2, 1]"),
     (
         "[option]\nconfirmed = { span = [1, 2], meaning = 'm' }",
-        "[option] confirmed: 'confirmed' cannot be an option's name: reserved name; every drive has it",
+        "[option] confirmed: 'confirmed' cannot be an option's name: reserved name: every drive",
     ),
     ("gaps = { input = [9, 1] }", "gaps: input = [9, 1] is in the wrong"),
     ("silence = '2 s'", "silence = '2 s' is more than 1 s"),
     ("response_timeout = '11 s'", "'11 s' is more than 10 s"),
-    ("framings = ['tcp']", "'tcp' is none of rtu, ascii"),
-    ("framings = ['delixi']", "'delixi' is none of rtu, ascii"),
-    ("exceptions = { 300 = 'x' }", "300 = 'x' is not a code from 1 to 255"),
+    ("framings = ['tcp']", "'tcp' is not one of rtu, ascii"),
+    ("framings = ['delixi']", "'delixi' is not one of rtu, ascii"),
+    ("exceptions = { 300 = 'x' }", "300 = 'x' is not an exception code from 1 to 255"),
 ]
 WRONG_TEXTS = [  # each text has a mistake, and follows the valid text HEAD
     ("", "t.toml: declares no register; add [reading] and NAME = { at = 0x0010 }"),
     ("[readings]\na = { at = 1 }\n", "t.toml: unknown key 'readings'; did you mean reading?"),
     ("[reading]\na = 5\n", "t.toml: [reading] a: 5 is not a register; write { at = 0x0010"),
-    ("[reading]\na = {}\n", "t.toml: [reading] a: its address is missing; add at = 0x2000"),
-    ("[reading]\nname = { at = 1 }\n", "t.toml: [reading] name: reserved name; every drive"),
+    ("[reading]\na = {}\n", "t.toml: [reading] a: the register's address is missing; add at = 0x2000"),
+    ("[reading]\nname = { at = 1 }\n", "t.toml: [reading] name: reserved name: every drive"),
     ("[reading]\nclass = { at = 1 }\n", "t.toml: [reading] class: 'class' cannot be a register's"),
     ('[setting]\na = { at = "30001" }\n', "an input register cannot be written"),
     ("[setting]\na = { at = 1 }\nb = { at = 1, step = 2 }\n", "b: a is written at the same address"),
-    ("[reading]\nstart = { at = 1 }\n", "[reading] start: reserved name; every drive has it"),
+    ("[reading]\nstart = { at = 1 }\n", "[reading] start: reserved name: every drive has an attribute"),
     ("registers = ['/etc/passwd']\n", "registers = '/etc/passwd' is not a CSV file"),
     (
         "registers = ['/etc/x.csv']\n",
@@ -359,7 +360,7 @@ WRONG_FILES = [  # each text is a whole family file with a mistake
     ("[family", "t.toml: the file is not TOML: a header lacks a bracket"),
     (
         '[[line]]\nname = "L"\n',
-        "is a plant file, as its [[line]] says; name a drive of it, as PLANT.toml DRIVE",
+        "is a plant file, not a family file; to name one of its drives, write PLANT.toml DRIVE",
     ),
     ("family = 3\n", "[family]: 3 is not a table with title"),
     ("family = 3\nreading = 4\n", "[reading] is not a table"),
@@ -390,7 +391,7 @@ def test_mistake_in_a_family_file_is_reported_with_its_line(tmp_path: Path, text
         ),
         (b"name,adress\na,1\n", "c.csv: line 1: unknown key 'adress'"),
         (b"name,at,at\na,1,2\n", "c.csv: line 1: two columns are called 'at'"),
-        (b"name,at\na,1,5\n", "c.csv: line 2: has 3 cells, and the first line has 2: a comma in a number"),
+        (b"name,at\na,1,5\n", "c.csv: line 2: has 3 cells, but the first line names 2 columns"),
         (b"name;at;step\na;1;0,1\n", "c.csv: line 2, column step: '0,1' has a decimal comma; write 0.1"),
         (b'name,at,step\na,1,"1.000,5"\n', "column step: '1.000,5' has a decimal comma; write 1000.5"),
         (
@@ -403,7 +404,7 @@ def test_mistake_in_a_family_file_is_reported_with_its_line(tmp_path: Path, text
             "column values: 'off' is not of the form name=number; write off=0 | on=1",
         ),
         (b"name,at,title\na,1,tok\n", "column title: 'tok' is not of the form language=title; write ru="),
-        (b"name,at,title\na,1,ru=a|ru=b\n", "column title: ru is given twice; give each only once"),
+        (b"name,at,title\na,1,ru=a|ru=b\n", "column title: ru is given twice; give it once"),
         (b"name,at,moves\na,1,maybe\n", "column moves: 'maybe' is neither true nor false"),
         (b'name,at\na,"1\n', "c.csv: line 2: is not CSV: "),
         (b"name,at\n\xff,1\n", "c.csv: is not text in UTF-8, from byte 8 on; save it as CSV UTF-8"),
@@ -484,10 +485,10 @@ def test_family_file_can_declare_text_registers(tmp_path: Path) -> None:
         ("a = { at = 1, length = 126 }", "length = 126 of a text is not 1 to 125 registers"),
         ("a = { at = 1, length = 2, order = 'CDAB' }", "a text has order = 'CDAB'"),
         ("a = { at = '00001', length = 2 }", "a text has the table 'coil'; a text must be in"),
-        ("a = { at = 1, length = 2 }\n[reading]\na = { at = 1 }", "a register has this name too"),
+        ("a = { at = 1, length = 2 }\n[reading]\na = { at = 1 }", "a register has the same name"),
         (
             "name = { at = 1, length = 2 }",
-            "[text] name: reserved name; every drive has it for something else",
+            "[text] name: reserved name: every drive has an attribute",
         ),
     ],
 )
@@ -523,9 +524,12 @@ def test_parameter_addresses_are_computed_by_the_rule_in_a_family_file(tmp_path:
         ("line = []", "[parameters]: 'groups' is missing; add groups = "),
         ("groups = [{ code = 1 }]", "[parameters], group number 1: code = 1 is not right; write code = "),
         ('groups = [{ code = "P", at = 0, count = 70000 }]', "count = 70000 is not right"),
-        ('groups = [{ code = "P", at = 0, count = 20000 }]', "groups have more than 10000 codes"),
+        ('groups = [{ code = "P", at = 0, count = 20000 }]', "groups have more than 10000 parameter codes"),
         ('groups = [{ code = "P", at = 0, count = 2 }]\nline = [1]', "line = [1] is not right"),
-        ('groups = [{ code = "P", at = 0, count = 2 }]\nfirmware = "x"', "firmware = 'x' is not a register"),
+        (
+            'groups = [{ code = "P", at = 0, count = 2 }]\nfirmware = "x"',
+            "firmware = 'x' is not the name of a register",
+        ),
     ],
 )
 def test_mistakes_in_the_parameters_section_are_reported(tmp_path: Path, rule: str, expected: str) -> None:

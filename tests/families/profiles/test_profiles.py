@@ -117,7 +117,7 @@ def test_all_mistakes_in_a_family_with_a_profile_are_reported_together() -> None
         "status: it is one word of bits, without a unit and a step",
         "reference: its unit is 'rpm'; this profile takes 'Hz' or '%'",
         "reference: a reference below 0 may turn the motor the other way; its span begins at 0",
-        "stop_word: reserved name; every profile has it for something else; rename the register",
+        "stop_word: reserved name: every profile has an attribute with this name; rename the register",
         "reset: this profile needs a register of this name, which is not declared",
         "output_frequency: this profile needs a register of this name, which is not declared",
         "fault: this profile needs a register of this name, which is not declared",

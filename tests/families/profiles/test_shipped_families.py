@@ -469,8 +469,8 @@ def test_all_mistakes_of_a_family_file_with_a_profile_are_reported_together(tmp_
         )
     message = str(wrong.value)
     for sentence in (
-        'formats has "7N1", and an RTU frame needs 8 data bits',
-        "[verb] is not supported; name a profile",
+        'formats has "7N1", but an RTU frame needs 8 data bits',
+        "[verb] is not supported; add profile to",
         "[command] control: harmless is set by the profile",
         "[reading] status: it is one word of bits",
         "reference: this profile needs a register of this name",

@@ -119,7 +119,9 @@ def _family(
 ) -> type[Drive] | None:
     """Return the class that the document declares; None if it has a mistake."""
     if "line" in document:
-        place.wrong("is a plant file, as its [[line]] says; name a drive of it, as PLANT.toml DRIVE", "line")
+        place.wrong(
+            "is a plant file, not a family file; to name one of its drives, write PLANT.toml DRIVE", "line"
+        )
         return None
     _check_sections(document, place)
     of_family = place.within("[family]", "family")
@@ -134,8 +136,8 @@ def _family(
     _add_csv(given.get("registers", []), declared, path, of_family, files)
     if counting.assumed and isinstance(of_document, dict) and "counts_from" not in of_document:
         of_family.wrong(
-            f"'counts_from' is missing, and {shown(counting.assumed[0])} is a number; add counts_from = 0 "
-            "where the manual's numbers are sent as they are, or 1 where its register 1 is sent as 0"
+            f"'counts_from' is missing, so the number {shown(counting.assumed[0])} is ambiguous. Add "
+            "counts_from = 0 if the manual's numbers are sent unchanged, or 1 if its register 1 is sent as 0"
         )
     texts = texts_of(document.get("text", {}), counting, declared.places, place)
     options = options_of(document.get("option", {}), declared.places, place)
@@ -170,7 +172,7 @@ def _family(
 def _base(given: Mapping[str, Any], place: TomlPlace) -> type[Drive]:
     """Return the base class that the family extends: a profile, a built-in family, or Drive."""
     if "profile" in given and "extends" in given:
-        place.wrong("has profile and extends; name one of them")
+        place.wrong("has the keys profile and extends; remove one of them")
     for key in ("profile", "extends"):
         if key in given:
             classes = bases(key)
@@ -196,11 +198,11 @@ def _check_inherited(
     _report(_inherited_errors(others, base.registers, base.title), declared, place)
     if "parameters" in document and base.parameter_space is not None:
         place.within("[parameters]", "parameters").wrong(
-            f"{base.title} has its own rule; leave this section out"
+            f"{base.title} has its own rule for parameters; remove this section"
         )
     if "identify" in document and base.identify is not Drive.identify:
         place.within("[[identify]]", "identify").wrong(
-            f"{base.title} has its own identity check; leave this section out"
+            f"{base.title} has its own identity check; remove this section"
         )
 
 
@@ -233,7 +235,9 @@ def bases(key: str) -> Mapping[str, type[Drive]]:
 def _check_sections(document: Mapping[str, Any], place: TomlPlace) -> None:
     sections = dict.fromkeys(SECTIONS)
     if "verb" in document:
-        place.wrong("[verb] is not supported; name a profile, or write the drive as a Python class", "verb")
+        place.wrong(
+            "[verb] is not supported; add profile to [family], or write the drive as a Python class", "verb"
+        )
         document = {name: table for name, table in document.items() if name != "verb"}
     if unknown := {name: None for name in document if name not in SECTIONS}:
         place.unknown(unknown, sections)
@@ -253,7 +257,7 @@ def _add_csv(
     names: list[Any], declared: Declared, path: Path, place: TomlPlace, files: dict[Path, bytes]
 ) -> None:
     if len(names) > MOST_CSV_FILES:
-        place.wrong(f"registers names {len(names)} files, and {MOST_CSV_FILES} are the most")
+        place.wrong(f"registers names {len(names)} files, more than the allowed {MOST_CSV_FILES}")
         return
     for name in names:
         table = place.attempt(beside, path, name)

@@ -111,7 +111,7 @@ def _numbered(text: str, table: str | None) -> tuple[int, str]:
     if table is not None and table != named:
         raise ValueError(
             f'"{text}" begins with {text[0]}, which stands for table {named}, but table = "{table}"; '
-            f"leave out table, or write a number of table {table}"
+            f"remove the key table, or write an address of table {table}"
         )
     if not 1 <= number <= LAST_ADDRESS + 1:
         first, last = f"{text[0]}{1:0{len(text) - 1}}", f"{text[0]}65536"
@@ -185,7 +185,7 @@ def _pairs(cell: str, form: str, example: str) -> Iterator[tuple[str, str]]:
         if not equals or not name or not given:
             raise ValueError(f"{part.strip()!r} is not of the form {form}; write {example}")
         if name in found:
-            raise ValueError(f"{name} is given twice; give each only once")
+            raise ValueError(f"{name} is given twice; give it once")
         found.add(name)
         yield name, given
 

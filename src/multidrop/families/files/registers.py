@@ -226,9 +226,7 @@ def _titles(value: Any) -> Mapping[str, str]:
         raise ValueError("the value is not a table of titles by language")
     for language, title in value.items():
         if language not in LANGUAGES:
-            raise ValueError(
-                f"it has the unknown language {language[:20]}, not one of {', '.join(LANGUAGES)}"
-            )
+            raise ValueError(f"the language {language[:20]} is unknown, not one of {', '.join(LANGUAGES)}")
         if not 1 <= len(_text(title)) <= LONGEST_TITLE:
             raise ValueError(f"the value has a title of {len(title)} characters, not 1 to {LONGEST_TITLE}")
     return value
@@ -393,7 +391,7 @@ class Declared:
             place.wrong(f"{shown(name)} cannot be a register's name: {why}")
             return False
         if name in TAKEN_NAMES:  # such a register would replace the verb or attribute of this name
-            place.wrong("reserved name; every drive has it for something else; rename the register")
+            place.wrong("reserved name: every drive has an attribute with this name; rename the register")
             return False
         if first := self.places.get(name):
             is_here = first.path == place.path
@@ -406,7 +404,7 @@ class Declared:
     def _converted(self, given: Mapping[str, Any], place: TomlPlace) -> dict[str, Any]:
         meant = place.unknown(given, REGISTER_KEYS) if given.keys() - REGISTER_KEYS.keys() else set()
         if "at" not in given and "at" not in meant:
-            place.wrong(f"its address is missing; add {REGISTER_KEYS['at'].example}")
+            place.wrong(f"the register's address is missing; add {REGISTER_KEYS['at'].example}")
         good = {}
         for key, value in given.items():
             if key in REGISTER_KEYS:
@@ -548,7 +546,7 @@ def _columns(header: list[str], place: TomlPlace) -> list[str] | None:
     before = len(place.config_errors)
     meant = place.unknown(dict.fromkeys(columns), COLUMNS) if set(columns) - COLUMNS.keys() else set()
     for name in {name for name in columns if columns.count(name) > 1}:
-        place.wrong(f"two columns are called {name!r}; each has a name of its own")
+        place.wrong(f"two columns are called {name!r}; give each its own name")
     for name in NEEDED:
         if name not in columns and name not in meant:
             place.wrong(
@@ -560,8 +558,8 @@ def _columns(header: list[str], place: TomlPlace) -> list[str] | None:
 def _declare(columns: list[str], row: list[str], declared: Declared, place: TomlPlace) -> None:
     if any(row[len(columns) :]):
         place.wrong(
-            f"has {len(row)} cells, and the first line has {len(columns)}: "
-            "a comma in a number or a text? write 0.1, and texts in quotes"
+            f"has {len(row)} cells, but the first line names {len(columns)} columns. Write numbers with a "
+            "point, as 0.1, and put texts with a comma in quotes"
         )
         return
     filled = {name: cell for name, cell in zip(columns, row, strict=False) if cell}

@@ -155,7 +155,7 @@ def _unit_addresses(value: list[Any]) -> range:
     least, most = UNIT_IDS[0], UNIT_IDS[-1]
     if len(value) != 2 or not all(map(is_whole, value)) or not least <= value[0] <= value[1] <= most:
         raise ValueError(
-            f"a range is its first and its last address, from 1 to 247 ({least} to {most} on Modbus TCP)"
+            f"a range has a first and a last address from 1 to 247 ({least} to {most} on Modbus TCP)"
         )
     return range(value[0], value[1] + 1)
 
@@ -186,13 +186,13 @@ def _by_framing(formats: Any, framings: tuple[Framing, ...], place: TomlPlace) -
     if isinstance(formats, dict):
         named = {str(framing): framing for framing in framings}
         for name in [name for name in formats if name not in named]:
-            place.wrong(f"formats has {name!r}, which is none of its framings: {', '.join(named)}")
+            place.wrong(f"formats has {name!r}, which is not one of the framings {', '.join(named)}")
         for name in [name for name in named if name not in formats]:
-            place.wrong(f'formats has none for {name}; add {name} = ["8N1"]')
+            place.wrong(f'formats has no list for {name}; add {name} = ["8N1"]')
         found = {framing: formats.get(name, ("8N1",)) for name, framing in named.items()}
     for format in found.get(Framing.RTU, ()):
         if format[0] != "8":
-            place.wrong(f'formats has "{format}", and an RTU frame needs 8 data bits; write "8{format[1:]}"')
+            place.wrong(f'formats has "{format}", but an RTU frame needs 8 data bits; write "8{format[1:]}"')
     return found
 
 
@@ -200,7 +200,7 @@ def _framings(value: list[Any]) -> tuple[Framing, ...]:
     known = {str(framing): framing for framing in (Framing.RTU, Framing.ASCII)}
     wrong = [each for each in value if not isinstance(each, str) or each.lower() not in known]
     if wrong:
-        raise ValueError(f"{shown(wrong[0])} is none of {', '.join(known)}")
+        raise ValueError(f"{shown(wrong[0])} is not one of {', '.join(known)}")
     return tuple(dict.fromkeys(known[each.lower()] for each in value))
 
 
@@ -213,7 +213,7 @@ def _exceptions(value: dict[str, Any]) -> dict[int, str]:
         except ValueError:
             raise ValueError(f"{code!r} is not an exception code") from None
         if not 1 <= number <= 255 or not isinstance(meaning, str) or not meaning.isprintable():
-            raise ValueError(f"{code} = {shown(meaning)} is not a code from 1 to 255 with its meaning")
+            raise ValueError(f"{code} = {shown(meaning)} is not an exception code from 1 to 255 with a text")
         found[number] = meaning
     return found
 
@@ -242,13 +242,15 @@ def _by_table(given: Mapping[str, Any], counting: Counting, place: TomlPlace) ->
     for key in ("together", "gaps"):
         for table, value in given.get(key, {}).items():
             if table not in TABLES:
-                place.wrong(f"{key} has {table!r}, which is not a table; write {', '.join(TABLES)}")
+                place.wrong(f"{key} has {table!r}, which is not a register table; write {', '.join(TABLES)}")
             elif key == "together":
                 if is_whole(value) and 1 <= value <= MOST_TOGETHER[table]:
                     most[TABLES[table]] = value
                 else:
                     most_of = f"1 to {MOST_TOGETHER[table]}"
-                    place.wrong(f"together: {table} = {shown(value)} is not {most_of} registers in one read")
+                    place.wrong(
+                        f"together: {table} = {shown(value)} is not a number of registers from {most_of}"
+                    )
             elif (span := place.attempt(_gap, table, value, counting)) is not None:
                 gaps[TABLES[table]] = span
     named: dict[str, Any] = {"most_registers": most, "readable_gaps": gaps}
@@ -289,16 +291,18 @@ def options_of(table: Any, registers: Collection[str], place: TomlPlace) -> dict
         at = place.within(f"[option] {name[:60]}", "option", name)
         why = unusable(name)
         if why or name in NOT_OPTIONS:
-            reason = why or "reserved name; every drive has it for something else"
+            reason = why or "reserved name: every drive has an attribute with this name"
             at.wrong(f"{shown(name)} cannot be an option's name: {reason}")
         if name in registers:
-            at.wrong("a register has this name too; call one of the two otherwise")
+            at.wrong("a register has the same name; rename one of the two")
         good = at.check(given, OPTION_KEYS)
         span = good.get("span", [])
         if span and (
             len(span) != 2 or not all(is_number(end) and abs(end) < inf for end in span) or span[0] > span[1]
         ):
-            at.wrong(f"span = {shown(span)} is not right; write the least and the most, span = [1, 600]")
+            at.wrong(
+                f"span = {shown(span)} is not right; write the smallest and largest value: span = [1, 600]"
+            )
         elif span and "meaning" in good:
             options[name] = Option(good.get("unit", ""), (span[0], span[1]), good["meaning"])
     return options
@@ -332,7 +336,7 @@ def texts_of(
         place.wrong("[text] is not a table; write [text] and NAME = { at = 0xFC00, length = 8 }", "text")
         return {}
     if len(section) > MOST_TEXTS:
-        place.wrong(f"[text] has {len(section)} texts, and {MOST_TEXTS} are the most")
+        place.wrong(f"[text] has {len(section)} texts, more than the allowed {MOST_TEXTS}")
         return {}
     found: dict[str, Text] = {}
     for name, given in section.items():
@@ -341,9 +345,9 @@ def texts_of(
         if why:
             at.wrong(f"{shown(name)} cannot be a text's name: {why}")
         elif name in TAKEN_NAMES:
-            at.wrong("reserved name; every drive has it for something else; rename the text")
+            at.wrong("reserved name: every drive has an attribute with this name; rename the text")
         elif name in registers:
-            at.wrong("a register has this name too; call one of the two otherwise")
+            at.wrong("a register has the same name; rename one of the two")
         declared = _text(at.check(given, TEXT_KEYS), counting, at)
         if declared is not None and not why and name not in TAKEN_NAMES:
             found[name] = declared
@@ -411,7 +415,7 @@ def parameter_space_of(
     ]
     kept = [group for group in groups if group is not None]
     if sum(len(group.indices) for group in kept) > MOST_PARAMETERS:
-        at.wrong(f"groups have more than {MOST_PARAMETERS} codes")
+        at.wrong(f"groups have more than {MOST_PARAMETERS} parameter codes in all")
         return None
     lists = {name: tuple(good.get(name, ())) for name in ("monitors", "line", "passwords")}
     never = good.get("never", {})
@@ -421,7 +425,7 @@ def parameter_space_of(
             return None
     firmware = good.get("firmware", "")
     if firmware and firmware not in registers:
-        at.wrong(f"firmware = {firmware!r} is not a register of this file")
+        at.wrong(f"firmware = {firmware!r} is not the name of a register in this file")
     return ParameterSpace(
         tuple(kept),
         monitors=lists["monitors"],
@@ -477,7 +481,7 @@ def proofs_of(section: Any, registers: Mapping[str, Register[Any]], place: TomlP
     """Return the registers that identify the family, from the valid [[identify]] tables."""
     tables = section if isinstance(section, list) else [section]
     if len(tables) > MOST_PROOFS:
-        place.wrong(f"[[identify]] has {len(tables)} tables, at most {MOST_PROOFS} are allowed")
+        place.wrong(f"[[identify]] has {len(tables)} tables, more than the allowed {MOST_PROOFS}")
         return ()
     found = (_proof(table, registers, at) for table, at in place.inside("identify", tables))
     return tuple(proof for proof in found if proof is not None)
@@ -490,7 +494,7 @@ def _proof(table: Any, registers: Mapping[str, Register[Any]], place: TomlPlace)
     if name is None:
         return None
     if name not in registers or not registers[name].readable:
-        place.wrong(f"register = {name!r} is not a readable register of this file")
+        place.wrong(f"register = {name!r} is not the name of a readable register in this file")
         return None
     if not all(map(is_number, values)):
         place.wrong(f"is = {values!r} is not right; write {PROOF_KEYS['is'].example}")
@@ -498,7 +502,7 @@ def _proof(table: Any, registers: Mapping[str, Register[Any]], place: TomlPlace)
     if not good.keys() & {"is", "above", "below"}:
         # a key that is misspelt or has a wrong value was reported above
         if len(place.config_errors) == before:
-            place.wrong("says no value; add is = [0x010A], or above and below")
+            place.wrong("has no expected value; add is = [0x010A], or the keys above and below")
         return None
     proof = Proof(name, tuple(values), good.get("above", -inf), good.get("below", inf))
     if why := _proves_nothing(proof, registers[name]):
@@ -515,7 +519,7 @@ def _proves_nothing(proof: Proof, register: Register[Any]) -> str:
     least, most = sorted(float(end * register.scale + coding.offset) for end in coding.raw_span)
     values = [value for value in proof.values if least <= value <= most and proof.holds(value)]
     if not (proof.above < proof.below and proof.above < most and proof.below > least):
-        return "no value is above and below these limits"
+        return "no value of the register is within these limits"
     if proof.values and not values:
         return f"is = {shown([*proof.values])} has no value that the register can hold within the limits"
     return "" if proof.values or proof.above >= least or proof.below <= most else "every value is accepted"

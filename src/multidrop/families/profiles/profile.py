@@ -71,7 +71,7 @@ def own_errors(
     if name in roles:
         yield from role_errors(name, roles[name], register)
     elif name in taken:
-        yield f"{name}: reserved name; every profile has it for something else; rename the register"
+        yield f"{name}: reserved name: every profile has an attribute with this name; rename the register"
     elif register.harmless:
         yield f"{name}: only control has harmless counts, and the profile states them; leave them out"
     if name == "reference" and (register.span or register.coding.raw_span)[0] < 0:
