@@ -337,11 +337,15 @@ class JoinedStops:
 
         `drives` says which drives it stops, and `start` starts it.
         """
-        if self._running[drives] < MOST_STOPS:
+        if not self.joins(drives):
             return self._start(drives, start)
         if drives not in self._joined:
             self._joined[drives] = supervisor().start("joined stops", self._start_joined(drives, start))
         return self._joined[drives]
+
+    def joins(self, drives: object) -> bool:
+        """Return True if a further stop of these drives would be joined with others."""
+        return self._running[drives] >= MOST_STOPS
 
     async def _start_joined(self, drives: object, start: Callable[[], asyncio.Future[R]]) -> R:
         await asyncio.sleep(JOIN_S)

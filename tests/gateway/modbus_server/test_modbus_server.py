@@ -39,6 +39,7 @@ from multidrop.errors import PortLost
 from multidrop.families import DelixiNative, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.gateway.commands import BUSY
 from multidrop.gateway.http.rights import NOT_ALLOWED, NOT_LISTED, Caller, Right
+from multidrop.gateway.modbus_server.passed_requests import ClientWrites
 from multidrop.gateway.modbus_server.protocol import PassingBusy
 from multidrop.gateway.modbus_server.settings import ModbusSettings
 
@@ -482,13 +483,24 @@ def test_a_stop_does_not_wait_for_earlier_requests_of_its_client(gateway: Gatewa
         assert {reply.transaction for _ in range(16) if (reply := client.receive())} == set(range(16))
 
 
-def test_a_flood_of_stops_is_answered_and_its_last_stops_are_sent_as_one(gateway: Gateway) -> None:
+def test_a_flood_of_stops_is_answered_and_its_last_stops_are_sent_as_one(
+    gateway: Gateway, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Only the first answers wait for their stops: thousands of waiting answers would delay other stops."""
+    waiting, later = list[object](), ClientWrites._later
+
+    def noted(*details: Any) -> Any:
+        waiting.append(details)
+        return later(*details)
+
+    monkeypatch.setattr(ClientWrites, "_later", noted)
     held = HeldCommands(gateway)
     with gateway.client() as client:
         for number in range(100):
             client.send(request(number, 1, 6, CHE_CONTROL, 5))
         codes = [reply.code for _ in range(100) if (reply := client.receive())]
         assert codes == [5] * 100
+        assert len(waiting) == MOST_STOPS
         until(lambda: len(gateway.commands.stopped) > MOST_STOPS)
         assert len(gateway.commands.stopped) == MOST_STOPS + 1
         held.release.set()

@@ -250,14 +250,14 @@ class ClientWrites:
                 raise Declined(ModbusCode.ILLEGAL_ADDRESS)
             if count != 1 or data == b"\0\0":
                 raise Declined(ModbusCode.ILLEGAL_VALUE)
-            return self._later(request, self._begin_stop(unit, client), stop_wait_s)
+            return self._stop_and_answer(unit, request, client, stop_wait_s)
         if register is None:
             raise Declined(
                 ModbusCode.ILLEGAL_ADDRESS if self._role >= Right.WRITE else ModbusCode.ILLEGAL_FUNCTION
             )
         raw = register.coding.raw_in(data, 0) if is_one else None
         if raw is not None and StopWrite(register.name, raw) in unit.stops:
-            return self._later(request, self._begin_stop(unit, client), stop_wait_s)
+            return self._stop_and_answer(unit, request, client, stop_wait_s)
         if self._role < Right.WRITE:
             raise Declined(ModbusCode.ILLEGAL_FUNCTION)
         if raw is None or register.commands:
@@ -266,6 +266,16 @@ class ClientWrites:
             raise Declined(ModbusCode.BUSY)
         write = self._write_one(unit, register, raw, request, client)
         return self._later(request, supervisor().start("modbus write", write), None)
+
+    def _stop_and_answer(
+        self, unit: Unit, request: MbapRequest, client: WritingClient, wait_s: float
+    ) -> Awaitable[bytes]:
+        """Start a stop. If it is joined with others, answer "acknowledge" now: they may be thousands."""
+        is_joined = self._stops.joins(unit.drive.name)
+        stopping = self._begin_stop(unit, client)
+        if is_joined:
+            raise Declined(ModbusCode.ACKNOWLEDGE)
+        return self._later(request, stopping, wait_s)
 
     async def _later(self, request: MbapRequest, task: asyncio.Future[int], wait_s: float | None) -> bytes:
         """Return the answer to a command.
