@@ -363,7 +363,7 @@ def test_flight_recordings_do_not_fill_the_disk(tmp_path: Path, monkeypatch: pyt
 
 @pytest.mark.parametrize("most_files", [0, -1])
 def test_a_flight_recorder_that_may_keep_no_file_is_refused(tmp_path: Path, most_files: int) -> None:
-    with pytest.raises(ValueError, match=f"most_files = {most_files}: it must be 1 or more"):
+    with pytest.raises(ValueError, match=f"most_files = {most_files} is not 1 or more"):
         FlightRecorder(tmp_path, ["hall-1"], most_files=most_files)
 
 

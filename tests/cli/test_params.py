@@ -226,7 +226,7 @@ def test_contradicting_options_of_run_are_refused(run: Run, tmp_path: Path) -> N
     path = write_test(tmp_path)
     assert run("run", path, "--speed", 3)[::2] == (
         2,
-        "multidrop: --speed changes the pace of simulated time, so it needs --simulate\n",
+        "multidrop: --speed is the pace of simulated time: add --simulate, or remove --speed\n",
     )
     assert "--simulate opens its own ports" in run("run", path, "--simulate", "--port", "hall=x")[2]
     status, _, errors = run("run", path)

@@ -303,7 +303,7 @@ def test_the_row_queue_frees_chunks_of_memory_that_it_does_not_keep_for_reuse() 
 
 def test_a_code_without_a_name_raises() -> None:
     with pytest.raises(
-        ValueError, match=r"^a code has no name, or the names of one batch have more than 2 GiB"
+        ValueError, match=r"^a row has a code without a name, or the names of one batch have more than 2 GiB"
     ):
         spell(memoryview(array("H", [0, 1])), Names(["pump"]))
 

@@ -355,7 +355,7 @@ def test_building_a_reply_with_an_unknown_function_raises(function: int) -> None
 
 
 def test_a_request_with_251_data_bytes_raises() -> None:
-    with pytest.raises(ValueError, match="251 data bytes do not fit a frame: 250 at most"):
+    with pytest.raises(ValueError, match="a frame holds at most 250 data bytes, not 251"):
         build_request(RTU, Message(1, 0x10, 0, 123, bytes(251)))
 
 

@@ -222,10 +222,19 @@ def test_only_multidrop_serve_with_a_fleet_accepts_a_plant_without_lines(tmp_pat
 @table(
     ("more", "sentence"),
     [
-        ("[serve.history]", "[serve.history] needs lines in this plant file; `multidrop hub` stores"),
-        ("[serve.modbus]", "[serve.modbus] needs lines in this plant file; it serves only values"),
-        ('[serve.tool]\npty = { hall = "tool" }', "[serve.tool] needs lines in this plant file; vendors'"),
-        ('[serve.may]\nverbs = ["a.start"]', "[serve.may] lists need lines in this plant file; [fleet.may]"),
+        (
+            "[serve.history]",
+            "[serve.history] needs [[line]] tables in this plant file; `multidrop hub` stores",
+        ),
+        ("[serve.modbus]", "[serve.modbus] needs [[line]] tables in this plant file; it serves only values"),
+        (
+            '[serve.tool]\npty = { hall = "tool" }',
+            "[serve.tool] needs [[line]] tables in this plant file; vendors'",
+        ),
+        (
+            '[serve.may]\nverbs = ["a.start"]',
+            "[serve.may] lists need [[line]] tables in this file; [fleet.may]",
+        ),
     ],
 )
 def test_parts_that_need_lines_are_refused_in_a_plant_without_lines(

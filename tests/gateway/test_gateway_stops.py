@@ -451,7 +451,7 @@ def test_without_an_audit_log_only_stops_are_sent(tmp_path: Path, monkeypatch: p
 @pytest.mark.usefixtures("_broken_parts")
 def test_a_gateway_part_that_cannot_start_is_reported_in_one_sentence(tmp_path: Path) -> None:
     for how, sentence in (
-        ("library", r"\[serve.mqtt\]: it needs nosuch, which is not installed: pip install 'paho-mqtt"),
+        ("library", r"\[serve.mqtt\]: the library nosuch is not installed: pip install 'paho-mqtt"),
         ("port", r"\[serve.mqtt\]: 127.0.0.1:1502 cannot be had"),
     ):
         with pytest.raises(ValueError, match=sentence), served(tmp_path, f'[serve.mqtt]\nbreaks = "{how}"\n'):

@@ -314,7 +314,7 @@ def test_a_missing_apprise_library_is_reported(tmp_path: Path, monkeypatch: pyte
     (tmp_path / "targets").write_text("ntfy://alarms\n")
     context: Any = SimpleNamespace(plant=SimpleNamespace(path=tmp_path / "plant.toml"), page="")
     settings = SimpleNamespace(targets="targets", most=60, on=[FAULT])
-    with pytest.raises(ValueError, match=r"it needs apprise, which is not installed: pip install .*notify"):
+    with pytest.raises(ValueError, match=r"the library apprise is not installed: pip install .*notify"):
         build("notify", settings, context)
 
 

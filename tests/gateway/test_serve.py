@@ -111,7 +111,10 @@ def test_a_plant_that_was_not_read_from_a_file_cannot_be_reloaded(tmp_path: Path
         gateway.gateway.reload._read = None
         writer = {"authorization": gateway.bearer(Right.WRITE)}
         told = gateway.post("/api/reload", {"confirm": True}, **writer).json
-        assert (told["done"], told["text"]) == (False, "this plant has no file to be read again")
+        assert (told["done"], told["text"]) == (
+            False,
+            "this plant was not read from a file, so it cannot be reloaded",
+        )
 
 
 @pytest.mark.long

@@ -378,7 +378,7 @@ def test_a_missing_library_is_reported(tmp_path: Path, serve: str, library: str,
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(sys.modules, library, None)
         (only,) = mistakes(tmp_path, f"{serve}\n")
-    start = f"{serve.split()[0]}: it needs {library}, which is not installed: pip install "
+    start = f"{serve.split()[0]}: the library {library} is not installed: pip install "
     assert only.startswith(start)
     assert f"multidrop[{extra}]" in only
 

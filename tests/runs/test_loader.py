@@ -91,19 +91,19 @@ MISTAKES = {  # text of a test file: number of the wrong line, part of the error
     STEP + 'dwell = "1 s"\ndirection = "forward"': (6, 'direction needs start; add start = ["pump-1"]'),
     STEP + "frequency = { fan = 51 }": (5, "51"),
     STEP + 'frequency = { fan = "x" }': (5, "'x' is not a number in Hz"),
-    STEP + "frequency = { fan = [1, 2, 3], pump = [1, 2] }": (5, "must have equally many numbers"),
+    STEP + "frequency = { fan = [1, 2, 3], pump = [1, 2] }": (5, "must all have the same length"),
     STEP + "frequency = { fan = 20 }\nrate = 1": (6, "a ramp of fan needs a start"),
     STEP + "frequency = { fan = 20 }\nrate = -1": (6, "rate = -1 is not right"),
     STEP + "rate = 1": (5, "rate needs frequency; add frequency"),
     STEP + 'until = "fan.fault == 0"': (5, "until needs within; add within"),
     STEP + 'dwell = "1 s"\nwithin = "1 s"': (6, "within needs until; add until"),
-    STEP + 'stop = ["fan"]\nfrequency = { fan = 20 }': (5, "fan is stopped and commanded in one step"),
+    STEP + 'stop = ["fan"]\nfrequency = { fan = 20 }': (5, "fan is stopped and also commanded in this step"),
     STEP + "write = { fan = 3 }": (5, "write of fan: 3 is not right"),
     STEP + "write = { fan = { setpoint = 101 } }": (5, "setpoint"),
     STEP + "write = { fan = { control = 'forward' } }": (5, "which only verbs may do: use start()"),
     STEP + "frequency = { eeprom = 20 }": (5, "may be kept in EEPROM, which steps would wear out"),
     STEP + "write = { eeprom = { frequency = 20 } }": (5, 'declare ram = ["frequency"]'),
-    STEP.replace('"a"', '"stop"') + 'dwell = "1 s"': (3, 'name "stop" is that of the stops at the end'),
+    STEP.replace('"a"', '"stop"') + 'dwell = "1 s"': (3, 'name "stop" is reserved for the stops at the end'),
     STEP + 'dwell = "1 s"\n' + STEP + 'dwell = "1 s"': (7, "another phase already has this name"),
     STEP.replace("\n[[", "\nrepeat = 0\n[[") + 'dwell = "1 s"': (4, "repeat = 0 is not right"),
     STEP.replace("\n[[", "\nrepeat = 99999\n[[") + 'dwell = "1 s"\n[[phase.step]]\ndwell = "1 s"': (
@@ -165,7 +165,7 @@ def test_a_missing_plant_file_is_reported_with_the_line_that_names_it(tmp_path: 
 
 def test_a_plant_with_a_drive_named_test_is_refused(tmp_path: Path) -> None:
     path = write_test(tmp_path, '[[phase]]\nname = "a"\n[[phase.step]]\ndwell = "1 s"', test=CHE)
-    with pytest.raises(ValueError, match=r'test.toml:1: the plant has a drive "test"'):
+    with pytest.raises(ValueError, match=r'test.toml:1: the drive name "test" is reserved'):
         load_test(path)
 
 

@@ -166,7 +166,7 @@ def test_a_test_run_whose_steps_would_wear_eeprom_is_refused() -> None:
 @table(
     "step, sentence",
     [
-        (RunStep("b", start=("fan",), stop=("fan",)), "b: fan is stopped and commanded in one step"),
+        (RunStep("b", start=("fan",), stop=("fan",)), "b: fan is stopped and also commanded in this step"),
         (RunStep("b", {"fan": 9.0}, rate=1.0, start=("fan",)), "b: fan cannot be started by a ramp"),
     ],
 )

@@ -536,9 +536,11 @@ def test_an_innovert_ibd_with_unreadable_line_settings_is_reported_as_uncertain(
     plan = sweeps(FAMILIES, baudrates=[9600], formats=["8N1", "8E1"])
     findings = found(line, plan)
     assert drives(findings) == declared(*bare)
-    assert {finding.doubt for finding in findings} == {"it only reads like one: look at its name plate"}
+    assert {finding.doubt for finding in findings} == {
+        "only its registers look like this model: check its name plate"
+    }
     text = plant_text("/dev/ttyUSB0", findings, MODELS)
-    assert text.count("# it only reads like one: look at its name plate") == 2
+    assert text.count("# only its registers look like this model: check its name plate") == 2
     assert text.count("# confirmed = 1  # once its name plate says so") == 2
 
 

@@ -54,7 +54,7 @@ class Replay:
                 self._note(lookup, sniffed, sniffed.request, after_s)
         names = {polled.drive.name for polled in plant.drives}
         if not self._replies.keys() & names:
-            raise ValueError(f"{path} has no exchange with {', '.join(sorted(names))}")
+            raise ValueError(f"the capture {path} has no exchange with {', '.join(sorted(names))}")
 
     def _note(
         self, lookup: RegisterLookup, exchange: SniffedExchange, request: Message, after_s: float

@@ -99,7 +99,7 @@ class FlightRecorder:
         most_files: int = 64,
     ) -> None:
         if most_files < 1:
-            raise ValueError(f"most_files = {most_files}: it must be 1 or more")
+            raise ValueError(f"most_files = {most_files} is not 1 or more")
         self.directory = Path(directory)
         self.written: list[Path] = []
         self._lines = lines

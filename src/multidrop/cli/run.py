@@ -54,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     if arguments.speed != 1.0 and not arguments.simulate:
-        raise ValueError("--speed changes the pace of simulated time, so it needs --simulate")
+        raise ValueError("--speed is the pace of simulated time: add --simulate, or remove --speed")
     if arguments.simulate and arguments.ports:
         raise ValueError("--simulate opens its own ports: remove --port")
     if arguments.out:

@@ -335,7 +335,7 @@ def spell(codes: memoryview[Any], names: Names) -> tuple[memoryview[Any], memory
         ffi.from_buffer("uint16_t[]", codes), rows, known.text, known.ends, known.names, offsets, text, room
     )
     if used < 0:
-        raise ValueError("a code has no name, or the names of one batch have more than 2 GiB")
+        raise ValueError("a row has a code without a name, or the names of one batch have more than 2 GiB")
     return memoryview(ffi.buffer(offsets)).cast("i"), memoryview(ffi.buffer(text, used))
 
 

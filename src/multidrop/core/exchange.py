@@ -66,7 +66,7 @@ def characters_on_wire(framing: Framing, length: int) -> int:
 
 def to_c(message: Message) -> Any:
     if len(message.data) > lib.MD_MOST_DATA:
-        raise ValueError(f"{len(message.data)} data bytes do not fit a frame: {lib.MD_MOST_DATA} at most")
+        raise ValueError(f"a frame holds at most {lib.MD_MOST_DATA} data bytes, not {len(message.data)}")
     try:
         return ffi.new(
             "struct md_message *",

@@ -474,7 +474,7 @@ class Port:
         """
         failure = lib.md_port_rs485(self.c, _SWITCHES[rs485], is_usb)
         if failure:
-            raise OSError(-failure, "the transceiver cannot be switched")
+            raise OSError(-failure, "the RS-485 transceiver cannot be switched to sending or receiving")
 
     def is_asking(self, peer: Peer) -> bool:
         """Return True while an exchange with this drive is queued, repeated, urgent or in flight."""

@@ -38,7 +38,7 @@ LOOK_S = 0.02  # interval, in s, of checks whether a reload has changed a drive 
 MOST_WRITES = 8  # limit of concurrent writes on one line; stops are not counted
 # Values of the field `rule` of WriteForbidden.
 BUSY = "too many writes are under way"
-STOOD_STILL = "the gateway stood still"
+STOOD_STILL = "the gateway was suspended"
 UNAUDITED = "the audit log cannot be written"
 OVERTAKEN = "a stop was called"
 

@@ -108,7 +108,7 @@ def missing_library(name: str, missing: ImportError) -> str:
     """Return the error message if a library that this part needs is not installed."""
     library = missing.name or str(missing)
     extra = EXTRAS.get(library.partition(".")[0], name)
-    return f"it needs {library}, which is not installed: {install_command(extra)}"
+    return f"the library {library} is not installed: {install_command(extra)}"
 
 
 class Building(NamedTuple):

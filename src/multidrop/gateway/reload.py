@@ -31,7 +31,7 @@ MOST_READS = 8  # limit of concurrent reads of the plant file, because each may 
 # time limit, in s, for putting a plant into effect, which opens ports and stops removed drives
 ADOPTION_S = 60.0
 RESTART = "takes effect after a restart"
-NO_FILE = "this plant has no file to be read again"
+NO_FILE = "this plant was not read from a file, so it cannot be reloaded"
 
 _log = logging.getLogger("multidrop.gateway")
 
@@ -122,7 +122,7 @@ class Reload:
         overtaken.cancel()
         if not reading.done():
             reading.cancel()
-            raise Hung("a later reload replaces this one")
+            raise Hung("this reload was replaced by a later reload")
         return reading.result()
 
     async def _carry_out(self) -> ReloadResult:

@@ -75,7 +75,7 @@ NOT_FOLLOWED = {  # parts that a gateway without lines of its own cannot have, e
     ),
     "modbus": "it serves only values that this gateway polls",
     "tool": "vendors' programs use the lines of this gateway",
-    "trigger": "it needs the rows that this gateway polls",
+    "trigger": "triggers need the rows that this gateway polls",
 }
 
 
@@ -203,11 +203,11 @@ def _check_followed(plant: Plant, settings: ServeSettings) -> None:
     place = replace(TomlPlace.in_file(plant.path), steps=(("serve", 1),))
     for name, other in NOT_FOLLOWED.items():
         if name in settings.parts:
-            place.wrong(f"[serve.{name}] needs lines in this plant file; {other}", name)
+            place.wrong(f"[serve.{name}] needs [[line]] tables in this plant file; {other}", name)
     if getattr(settings.parts.get("mqtt"), "rows", False):
-        place.wrong("rows = true of [serve.mqtt] needs lines in this plant file", "mqtt")
+        place.wrong("rows = true of [serve.mqtt] needs [[line]] tables in this plant file", "mqtt")
     if MAY_KEYS.keys() & plant.serve.get("may", {}).keys():
-        sentence = "[serve.may] lists need lines in this plant file; [fleet.may] is for a fleet's drives"
+        sentence = "[serve.may] lists need [[line]] tables in this file; [fleet.may] is for a fleet's drives"
         place.wrong(sentence, "may")
     if place.config_errors:
         raise PlantError(tuple(place.config_errors))
@@ -316,7 +316,7 @@ def _tokens(given: Mapping[str, Any], folders: Folders, place: TomlPlace) -> lis
         place.wrong(f"tokens {path}: {sentence}", "tokens")
     if not found and not wrong:
         place.wrong(
-            f"tokens {path} is empty; `multidrop serve --new-token stop --for anna` makes a line for it",
+            f"tokens {path} is empty; add the line that `multidrop serve --new-token stop --for anna` prints",
             "tokens",
         )
     return found

@@ -30,7 +30,7 @@ def contradictions(step: RunStep, frequency: Collection[str]) -> Iterator[tuple[
     """
     for name in dict.fromkeys(step.stop):
         if name in (*frequency, *step.write, *step.start):
-            yield "stop", f"{name} is stopped and commanded in one step; make two steps"
+            yield "stop", f"{name} is stopped and also commanded in this step; write two steps"
     for name in step.start:
         if step.rate and name in frequency:
             yield "start", f"{name} cannot be started by a ramp; start it in a step before"

@@ -74,7 +74,10 @@ def load_test(path: Path | str) -> RunPlan:
         raise ValueError("\n".join(place.config_errors))
     plant = load_plant(path.parent / given["plant"])
     if any(polled.drive.name == PHASE_DRIVE for polled in plant.drives):
-        place.wrong(f'the plant has a drive "{PHASE_DRIVE}", a name that the phases use; rename it', "plant")
+        place.wrong(
+            f'the drive name "{PHASE_DRIVE}" is reserved for phases; rename the drive in the plant file',
+            "plant",
+        )
     limits = _limits(given.get("abort", {}), place.within("abort", "abort"), plant)
     steps: list[RunStep] = []
     for table, at in place.inside("phase", given.get("phase", [])):
@@ -110,9 +113,11 @@ def _phase(table: Any, place: TomlPlace, plant: Plant) -> list[RunStep]:
     given = place.check(table, _PHASE)
     name, repeat = given.get("name", ""), given.get("repeat", 1)
     if name == STOP:
-        place.wrong(f'name "{STOP}" is that of the stops at the end; give the phase another name', "name")
+        place.wrong(
+            f'name "{STOP}" is reserved for the stops at the end; give the phase another name', "name"
+        )
     if name:
-        sentence = "another phase already has this name; each needs its own"
+        sentence = "another phase already has this name; give this phase another name"
         place.once("phase", name, sentence=sentence, key="name")
     if not 1 <= repeat <= MOST_STEPS:
         place.wrong(f"repeat = {repeat} is not right; write a number from 1 to {MOST_STEPS}", "repeat")
@@ -211,7 +216,7 @@ def _each(frequency: Mapping[str, Any], place: TomlPlace) -> Iterator[dict[str, 
                 return
     lengths = {len(numbers) for numbers in lists.values() if len(numbers) != 1}
     if len(lengths) > 1 or 0 in lengths:
-        place.wrong("the lists of frequencies must have equally many numbers", "frequency")
+        place.wrong("the lists of frequencies must all have the same length", "frequency")
         return
     for at in range(max(lengths, default=1)):
         yield {name: float(numbers[at % len(numbers)]) for name, numbers in lists.items()}

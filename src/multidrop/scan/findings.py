@@ -10,7 +10,7 @@ from multidrop.core import RS485, Framing
 from multidrop.drive.family import Drive
 from multidrop.drive.line_settings import Settings
 
-GUESS = "it only reads like one: look at its name plate"
+GUESS = "only its registers look like this model: check its name plate"
 
 
 def line_setting(settings: Settings, framing: Framing) -> str:

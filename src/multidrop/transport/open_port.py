@@ -56,7 +56,7 @@ def overruns(fd: int) -> int:
     Raises OSError if the driver does not count them.
     """
     if sys.platform != "linux":
-        raise OSError("only Linux counts overruns")
+        raise OSError("lost characters (overruns) are counted only on Linux")
     import fcntl  # Windows lacks this module
 
     counts = bytearray(_ICOUNTER.size)

@@ -110,7 +110,7 @@ def test_a_mistake_in_database_or_upload_settings_is_reported_in_one_sentence(
 def test_a_missing_library_of_a_receiver_is_reported_in_one_sentence() -> None:
     missing = ImportError("No module named 'pyarrow'", name="pyarrow")
     assert missing_library("influx", missing).startswith(
-        "it needs pyarrow, which is not installed: pip install 'pyarrow"
+        "the library pyarrow is not installed: pip install 'pyarrow"
     )
     missing = ImportError("No module named 'psycopg'", name="psycopg")
     assert "# multidrop[postgres]" in missing_library("postgres", missing)

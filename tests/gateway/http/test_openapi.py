@@ -346,5 +346,5 @@ def test_files_outside_the_folder_of_the_web_page_are_not_served(gateway: Served
 def test_a_gateway_without_a_web_page_answers_404(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(files.PageFiles.__init__, "__defaults__", (tmp_path / "missing",))
     with served(tmp_path) as gateway:
-        assert "this version of multidrop has no page" in gateway.get("/").json["error"]
+        assert "this installation of multidrop has no web page" in gateway.get("/").json["error"]
         assert gateway.get("/api/plant").status == 200

@@ -457,7 +457,7 @@ def test_a_write_over_nats_is_refused_if_it_is_late_or_repeated(
     write(25.0, sent_ms)
     assert told()["done"] is True
     write(25.0, sent_ms)
-    assert told()["text"] == "not sent: it is a copy of an earlier command"
+    assert told()["text"] == "not sent: the command is a copy of an earlier one"
     write(26.0, now_ms() - 60_000)
     assert "s ago by the clocks of sender and gateway" in told()["text"]
     publish(broker, "multidrop/pump-1/stop", b"stop", "-q", "1")

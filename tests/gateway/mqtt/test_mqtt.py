@@ -211,7 +211,7 @@ def test_a_recent_write_is_carried_out_once(broker: Broker, listener: Listener, 
     publish(broker, "multidrop/pump-1/set/setpoint", fresh)
     assert told(listener) == {"what": "setpoint = 25", "done": True, "text": "done", "id": "order-7"}
     publish(broker, "multidrop/pump-1/set/setpoint", fresh)
-    assert told(listener)["text"] == "not sent: it is a copy of an earlier command"
+    assert told(listener)["text"] == "not sent: the command is a copy of an earlier one"
     assert commanded.commands.noted == [("write", "pump-1", "setpoint", 25)]
 
 
@@ -345,7 +345,10 @@ def test_a_verb_that_is_not_a_text_is_refused(broker: Broker, listener: Listener
 
 def test_a_command_before_a_reload_is_refused(broker: Broker, listener: Listener, commanded: Any) -> None:
     """After a reload, the drive's name may mean another drive."""
-    for after_ms, text in ((1900, "not sent: it may have been sent before the plant"), (2500, "done")):
+    for after_ms, text in (
+        (1900, "not sent: the command may have been sent before the plant"),
+        (2500, "done"),
+    ):
         sent_ms, sent_ns = now_on_both_clocks()
         commanded.commands.plant_ns = sent_ns - after_ms * 1_000_000
         publish(broker, "multidrop/pump-1/set/setpoint", write_of(25, sent_ms))
@@ -365,7 +368,7 @@ def test_a_command_sent_before_a_stop_is_refused(
     ):
         publish(broker, f"multidrop/pump-1/{topic}", json.dumps(payload).encode())
         assert told(listener)["text"].startswith(
-            "done" if is_taken else "not sent: it may have been sent before"
+            "done" if is_taken else "not sent: the command may have been sent before"
         )
     act = {"verb": "emergency_stop", "drive": "pump-1", "time": sent_ms}
     publish(broker, "multidrop/pump-1/act", json.dumps(act).encode())

@@ -148,7 +148,7 @@ def _prepare_verb(drive: Drive, request: CommandRequest) -> Prepared:
 def _prepare_write(drive: Drive, request: CommandRequest) -> Prepared:
     register = drive.register(request.register)
     if not register.writable:
-        why = register.never or "it can only be read"
+        why = register.never or "the register can only be read"
         raise WriteForbidden(f"{request.entry} is never written: {why}", register=register.name)
     value = register.decode(register.encode(typed_value(register, request.value)))
     text = f"{drive.name}: {register.name} = {register.format(value)}"
@@ -223,7 +223,7 @@ class Offers:
         if left > 0:
             return ""
         age_s = (LIMIT_NS - left) / SECOND
-        return f"{age_s:.1f} s have passed since it was checked, and {LIMIT_NS / SECOND:g} s is allowed"
+        return f"the command was checked {age_s:.1f} s ago, and the limit is {LIMIT_NS / SECOND:g} s"
 
     def void(self, line: str, drives: Collection[str] | None, why: str) -> None:
         """Cancel the offered commands for these drives of a line, or for all its drives if `drives` is None.

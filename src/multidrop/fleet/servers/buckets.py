@@ -160,7 +160,7 @@ class Bucket:
         if not error:
             return _revision(said)
         if error.get("err_code") in _WRONG_REVISION:
-            raise Conflict(f"{self.name}.{key} is no longer at revision {revision}")
+            raise Conflict(f"the record {self.name}.{key} has changed since revision {revision}")
         raise OutcomeUnknown(f"NATS did not store {self.name}.{key}: {error.get('description')}")
 
     async def put_all(self, records: Sequence[Record]) -> WriteAnswers:

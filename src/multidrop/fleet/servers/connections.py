@@ -294,8 +294,8 @@ async def connect(url: str, options: Mapping[str, Any], denials: Denials | None 
     if (found.major, found.minor) < OLDEST:
         await _close(client)
         raise TooOld(
-            f"the NATS server at {masked(url)} is {found.major}.{found.minor}; a fleet needs "
-            f"{'.'.join(map(str, OLDEST))} or newer: older ones may give one lease to two gateways"
+            f"the NATS server at {masked(url)} has version {found.major}.{found.minor}, but a fleet needs "
+            f"{'.'.join(map(str, OLDEST))} or newer. Older servers may give one lease to two gateways"
         )
     return client
 

@@ -169,4 +169,4 @@ def _toml(value: Any) -> str:
         return str(value).lower()
     if isinstance(value, (int, float)):
         return repr(value)
-    raise ValueError(f"a plant file cannot hold {value!r}, a {type(value).__name__}")
+    raise ValueError(f"a plant file cannot contain {value!r} of type {type(value).__name__}")

@@ -83,7 +83,7 @@ class PageFiles:
             self._files = await supervisor().within("page files", READ_S, read)
         found = self._files.get(name)
         if found is None and name == INDEX:
-            raise Denied(404, "this version of multidrop has no page; /api/plant and /metrics are there")
+            raise Denied(404, "this installation of multidrop has no web page; use /api/plant or /metrics")
         if found is None:
             raise Denied(404, "unknown path")
         headers = {"etag": found.etag}

@@ -176,7 +176,7 @@ def moment_in(text: str, key: str) -> int:
     """
     ms = _moment(text, key)
     if not LEAST_MS <= ms <= MOST_MS:
-        raise Denied(400, f"{key} = {text[:40]!r} is not in the years 1 to 9999")
+        raise Denied(400, f"{key} = {text[:40]!r} is not a time in the years 1 to 9999")
     return ms
 
 

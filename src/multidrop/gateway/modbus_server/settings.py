@@ -101,7 +101,7 @@ class ModbusSettings:
             yield f"may = {self.may!r} is not one of {', '.join(ROLES)}"
         for drive, unit in self.units.items():
             if not _is_whole(unit, 1, 255):
-                yield f"units: {drive} = {unit!r} is not a unit id from 1 to 247 (255 at most)"
+                yield f"units: {drive} = {unit!r} is not a unit id; write 1 to 247 (or up to 255)"
         if not _is_whole(self.common, 0, 0x10000 - COMMON_LENGTH):
             yield f"common = {self.common!r} is not an address from 0 to {0x10000 - COMMON_LENGTH:#X}"
         if not _is_whole(self.channels, 0, 0xFFFF):

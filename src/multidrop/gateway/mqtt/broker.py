@@ -479,13 +479,13 @@ class BrokerCommands:
         """Return why a command with this age must not be carried out; "" if it may be carried out."""
         if not -MOST_AHEAD_MS <= age_ms <= MOST_AGE_MS:
             clocks = "by the clocks of sender and gateway"
-            return f"it was sent {age_ms / 1000:.1f} s ago {clocks}"
+            return f"the command was sent {age_ms / 1000:.1f} s ago {clocks}"
         if self._may_be_before(self._commands.stopped_ns(drive), age_ms):
-            return "it may have been sent before the latest stop: send it again"
+            return "the command may have been sent before the latest stop: send it again"
         if self._may_be_before(self._commands.plant_ns, age_ms):
-            return "it may have been sent before the plant was reloaded: send it again"
+            return "the command may have been sent before the plant was reloaded: send it again"
         if command in self._came:
-            return "it is a copy of an earlier command"
+            return "the command is a copy of an earlier one"
         if self._under_way >= MOST_COMMANDS:
             return f"{MOST_COMMANDS} other commands are under way"
         return ""
