@@ -81,6 +81,13 @@ def test_esphome_binary_sensor_with_several_mask_bits_is_reported(tmp_path: Path
     )
 
 
+def test_esphome_number_wider_than_its_register_count_is_reported(tmp_path: Path) -> None:
+    """Some devices, such as the JSY-MK meters, send 32 bits for one register."""
+    narrow = entity(tmp_path, "value_type: U_DWORD, register_count: 1")
+    assert gaps(narrow, "a") == ["U_DWORD needs more than register_count = 1: is a register wider?"]
+    assert gaps(entity(tmp_path, "value_type: U_DWORD, register_count: 4"), "a") == []
+
+
 def test_inverted_esphome_switch_is_reported(tmp_path: Path) -> None:
     assert "inverted was not carried over" in gaps(entity(tmp_path, "inverted: true", "switch"), "a")
 

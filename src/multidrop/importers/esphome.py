@@ -312,6 +312,9 @@ def _number(device: ImportedDevice, register: ImportedRegister, kind: str, entry
     if found is None:
         device.lose(register.name, f"its value_type {given[:40]} has no number format")
         return False
+    registers = whole(entry, "register_count", 0)
+    if 0 < registers < words_of(found):
+        register.gaps.append(f"{given} needs more than register_count = {registers}: is a register wider?")
     every = (1 << 16 * words_of(found)) - 1
     mask = whole(entry, "bitmask", every) & every
     if words_of(found) < 4 and mask != every:  # ESPHome ignores the bit mask of 64-bit numbers
