@@ -369,7 +369,7 @@ def test_the_command_wear_shows_the_eeprom_ledger(run: Run, port: str, toy: Simu
     assert run("write", port, TOY, 1, "acceleration_time", "12.5", "--yes")[0] == 0
     status, out, err = run("write", port, TOY, 1, "acceleration_time", "13", "--yes")
     assert (status, out) == (1, "")
-    assert "is written once in 60 s at most" in err
+    assert "but only one write in 60 s is allowed" in err
     assert "no writes to EEPROM yet" in run("wear")[1]  # writes to a simulated drive are not counted
     assert not records.Ledger().enter(
         records.LedgerCell("/dev/ttyS7", 1, "toy", "acceleration_time"), time.time(), 60.0

@@ -230,7 +230,7 @@ def test_a_bus_broadcasts_nothing_but_stops_after_leave(model: str) -> None:
     line, drives, _ = line_of(model, model)
     assert 0 in setpoint_of(drives[0]).broadcast
     line.bus.leave()
-    with pytest.raises(CancelledByStop, match="the bus was left"):
+    with pytest.raises(CancelledByStop, match="the bus was closed"):
         line.bus.broadcast(setpoint_of(drives[0]), 0.0)
     line.bus.broadcast(drives[0].control, stop_of(drives[0]))  # stops are broadcast even after `leave`
     (sent,) = broadcasts(line)

@@ -342,7 +342,10 @@ def test_a_bus_made_on_a_thread_warns_if_the_program_replaced_a_signal_handler(
     thread.start()
     thread.join(PATIENCE)
     assert (
-        caplog.text.count("SIGTERM will not stop the drives: the program has set its own handler since") == 1
+        caplog.text.count(
+            "SIGTERM no longer stops the drives, because the program set its own signal handler"
+        )
+        == 1
     )
     assert "SIGINT" not in caplog.text
     signal.raise_signal(signal.SIGTERM)
@@ -395,7 +398,7 @@ def test_a_signal_prints_the_stopped_drives(caught: list[int], capfd: pytest.Cap
     signal.raise_signal(signal.SIGINT)
     (told,) = capfd.readouterr().err.splitlines()
     assert told.startswith("multidrop: SIGINT received: stopping pump, fan-0, fan-1, ")
-    assert told.endswith("fan-18 and 6 more; Ctrl-C three times within a second gives up")
+    assert told.endswith("fan-18 and 6 more; press Ctrl-C three times within a second to give up")
     for act in acts:
         act.go_on.set()
     until(lambda: caught)

@@ -428,7 +428,8 @@ def test_the_error_of_a_withheld_stop_says_what_to_do() -> None:
     line, drive, sim = one(InvtCHE(1))
     sim["device"] = 0x010A
     with pytest.raises(
-        WriteForbidden, match=r"no stop was sent .* two reads showed .*010AH.* Use the hard-wired stop"
+        WriteForbidden,
+        match=r"no stop was sent .* two checks found another drive .*010AH.* Use the hard-wired stop",
     ):
         drive.stop()
     assert line.written == []
@@ -599,7 +600,7 @@ def test_another_make_is_recognised_although_its_first_reply_is_lost() -> None:
     count_silences(line)
     answers_as(line, {GOODRIVE_DEVICE: GOODRIVE, 0x2100: 3, 0x0000: 0})
     line.loses = lambda request: len(line.frames) == 1
-    with pytest.raises(WriteForbidden, match="it answers as an INVT Goodrive does"):
+    with pytest.raises(WriteForbidden, match="the drive answers as an INVT Goodrive does"):
         drive.set_frequency(20)
     assert line.written == []
 
@@ -612,7 +613,7 @@ def test_other_makes_are_still_recognised_after_a_missing_reply() -> None:
         drive.read("terminals")
     line.loses = lambda request: False
     answers_as(line, {0x3000: 3, 0x8000: 0, 0x1000: 0})
-    with pytest.raises(WriteForbidden, match="it answers as a Powtran PI130"):
+    with pytest.raises(WriteForbidden, match="the drive answers as a Powtran PI130"):
         drive.set_frequency(20)
     assert line.written == []
 

@@ -264,7 +264,7 @@ def test_the_motor_of_a_drive_attached_after_leave_cannot_be_started() -> None:
     line.bus.detach(drive)
     line.attach(drive)
     for call in (drive.start, drive.jog, lambda: drive.set_frequency(20)):
-        with pytest.raises(CancelledByStop, match="the bus was left"):
+        with pytest.raises(CancelledByStop, match="the bus was closed"):
             call()
     assert line.written == []
     drive.stop()

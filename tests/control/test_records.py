@@ -77,7 +77,7 @@ def test_all_paths_of_a_port_share_one_eeprom_budget(tmp_path: Path, monkeypatch
             f"spy://{device}",
         )
         for at, port in enumerate(spellings):
-            with pytest.raises(WriteForbidden, match="is written once in 60 s at most"):
+            with pytest.raises(WriteForbidden, match="but only one write in 60 s is allowed"):
                 write(port, 13.0 + at, ledger)
         (wear,) = ledger.wear(0)
         assert (wear.cell.port, wear.writes) == (device, 1)
@@ -88,7 +88,7 @@ def test_all_names_of_a_host_share_one_eeprom_write_a_minute(tmp_path: Path) -> 
     with toys("socket://127.0.0.1:0") as sim:
         path = sim.wires[0].path
         write(path, 12.0, ledger)
-        with pytest.raises(WriteForbidden, match="is written once in 60 s at most"):
+        with pytest.raises(WriteForbidden, match="but only one write in 60 s is allowed"):
             write(path.replace("127.0.0.1", "localhost"), 13.0, ledger)
         assert [each.cell.port for each in ledger.wear(0)] == [path.removeprefix("socket://")]
 
@@ -212,7 +212,7 @@ def test_a_write_to_a_simulated_drive_is_not_in_the_users_ledger(tmp_path: Path,
         path = sim.wires[0].path.replace("0.0.0.0", "127.0.0.1")
         write(path, 12.0)
         # the ledger limits the writes to a simulated drive too, but in a file of its own
-        with pytest.raises(WriteForbidden, match="is written once in 60 s at most"):
+        with pytest.raises(WriteForbidden, match="but only one write in 60 s is allowed"):
             write(path, 13.0)
     assert Ledger().wear(0) == []
     assert not list(default_ledger_path().parent.rglob("*.sqlite"))

@@ -161,7 +161,7 @@ def test_no_call_moves_a_motor_after_the_bus_is_closed() -> None:
         lambda: drive.write(drive.setpoint, 10.0),
         lambda: drive.send_raw(6, 0x1000, b"\0\1"),
     ):
-        with pytest.raises(CancelledByStop, match="the bus was left"):
+        with pytest.raises(CancelledByStop, match="the bus was closed"):
             call()
     assert writes(line, begun) == []
 
@@ -194,7 +194,7 @@ def test_a_silent_drives_stop_leaves_half_of_the_line_to_others(model: str, seco
 def test_a_stop_ends_after_its_time_limit_and_the_error_states_its_progress() -> None:
     line, (drive,), _ = che_drives(hz=50, runs_s=20)
     begun = line.seconds
-    with pytest.raises(Unconfirmed, match=r"it was not seen to stop within its 2 s"):
+    with pytest.raises(Unconfirmed, match=r"the motor was not seen to stop within 2 s"):
         drive.stop(seconds=2)
     assert 2 <= line.seconds - begun < 2.2
     line.deafens = lambda request: True
@@ -267,7 +267,7 @@ def test_a_stop_scripts_waits_end_at_its_time_limit() -> None:
     line = SimulatedBus(simulated(Patient(1)))
     drive = line.attach(Patient(1))
     begun = line.seconds
-    with pytest.raises(Unconfirmed, match="it was not seen to stop within its 2 s"):
+    with pytest.raises(Unconfirmed, match="the motor was not seen to stop within 2 s"):
         drive.stop(seconds=2)
     assert 2 <= line.seconds - begun < 2.5
     assert len(line.written) == 1

@@ -554,7 +554,7 @@ def test_a_write_permit_issued_before_or_during_a_stop_is_never_valid_again() ->
     latch.let_go("stop")
     assert (before.is_good, during.is_good) == (False, False)
     assert latch.permit().is_good
-    latch.shut("the bus was left")
+    latch.shut("the bus was closed")
     assert not latch.permit().is_good
 
 

@@ -161,7 +161,7 @@ def test_an_inherited_bus_raises_that_it_was_opened_before_the_fork(any_port: st
             stopped = [each.why for each in bus.stop_all().values()]
             with pytest.raises(LineError) as failure:
                 current(bus)
-            with pytest.raises(CancelledByStop, match="the start was not sent: the bus was left"):
+            with pytest.raises(CancelledByStop, match="the start was not sent: the bus was closed"):
                 bus.drives[0].start()
         return [*stopped, str(failure.value)]
 

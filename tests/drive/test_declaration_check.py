@@ -181,7 +181,7 @@ SCALED: dict[str, dict[str, Register[Any]]] = {
     "address 000BH between it and its scale register power is not declared": {
         "power": reading(12, number_format=NumberFormat.I16)
     },
-    "one request reads at most 125 registers, and these are 191 registers with its scale register power": {
+    "one request reads at most 125 registers, but these are 191 registers with its scale register power": {
         "power": reading(200, number_format=NumberFormat.I16)
     },
 }
@@ -210,7 +210,7 @@ def test_the_limit_of_registers_in_one_read_includes_the_scale_register() -> Non
         "between": reading(6),
         "power": reading(7, number_format=NumberFormat.I16),
     }
-    with pytest.raises(DeclarationError, match="one request reads at most 2 registers, and these are 3"):
+    with pytest.raises(DeclarationError, match="one request reads at most 2 registers, but these are 3"):
         type("Fan", (Drive,), registers)
 
 

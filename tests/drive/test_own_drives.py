@@ -114,7 +114,8 @@ def test_error_for_a_missing_verb_names_the_method_to_declare() -> None:
     line = SimulatedBus(simulated(Bare(1)))
     bare = line.attach(Bare(1, confirmed=1))
     with pytest.raises(
-        WriteForbidden, match=r"its class does not say .*: declare harmless = \(…\), moves = False, or"
+        WriteForbidden,
+        match=r"its class does not declare it harmless: add harmless = \(…\), moves = False, or",
     ):
         bare.write(bare.run, 1)
     assert line.frames == []

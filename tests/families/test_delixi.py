@@ -479,7 +479,7 @@ def test_delixi_writes_to_eeprom_are_limited_and_writes_to_ram_are_not(tmp_path:
     assert ledger.wear(line.seconds) == []
     assert not sim.counters.eeprom_writes
     drive.write(drive.stored_ramp, 1.0)
-    with pytest.raises(WriteForbidden, match="once in 60 s"):
+    with pytest.raises(WriteForbidden, match="only one write in 60 s"):
         drive.write(drive.stored_ramp, 2.0)
     assert sim.counters.eeprom_writes == {"stored_ramp": 1}
 

@@ -258,7 +258,7 @@ HAZARDS = {
         lambda line, drive, sim: [drive.set_frequency(50), drive.set_frequency(50), drive.set_frequency(49)],
         naive="01 06 00 02 13 24",
         sends=("01 06 00 02 13 88",),
-        refuses="once in 60 s",
+        refuses="only one write in 60 s",
     ),
     "D5: no start when the setpoint is not taken from P00.02": Hazard(
         delixi,

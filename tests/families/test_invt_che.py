@@ -368,7 +368,7 @@ def test_invt_che_stored_parameter_is_written_to_eeprom_and_counted(tmp_path: Pa
     drive.write(drive.jump, 0x1388)
     # the frame of section 11.6.2, with a checksum computed manually
     assert line.written[-1] == "02 06 00 08 13 88 05 6D"
-    with pytest.raises(WriteForbidden, match="once in 60 s"):
+    with pytest.raises(WriteForbidden, match="only one write in 60 s"):
         drive.write(drive.jump, 0x1389)
     assert sim.counters.eeprom_writes == {"jump": 1}
 

@@ -101,7 +101,7 @@ def test_running_motor_makes_apply_raise_and_write_nothing(family: type[Drive]) 
     sim.motor.target = 50.0
     sim.motor.run()
     line.sleep(20)
-    with pytest.raises(WriteForbidden, match="only written while its motor stands"):
+    with pytest.raises(WriteForbidden, match="written only while the motor stands"):
         params.apply(drive, {first.code: raw_of(sim, first) + 1})
     assert line.written == []
 

@@ -581,7 +581,7 @@ def test_registers_that_must_be_read_together_are_read_first() -> None:
 @table(
     ("details", "sentence"),
     [
-        ({"read_together": (("a", "far"),)}, "between them are addresses that are not declared"),
+        ({"read_together": (("a", "far"),)}, "there are undeclared addresses between these registers"),
         (
             {"read_together": (("a", "b"),), "most_registers": {HOLDING: 1}},
             "these registers span 2 addresses, but one",

@@ -322,7 +322,7 @@ format = "8N1"
 """
 SENTENCE = (
     "4 requests with readable_gaps = {INPUT: range(0x36, 0x46)} instead of 8: 0.268 s instead of 0.341 s; "
-    "state them if the document allows reading there"
+    "declare these gaps if the manual allows reads there"
 )
 
 

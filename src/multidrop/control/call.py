@@ -21,7 +21,7 @@ from multidrop.transport.exchange import Exchanges
 
 STOPPED = "a stop was called"
 REMOVED = "the drive was taken off the bus"
-LEFT = "the bus was left"
+LEFT = "the bus was closed"
 POLL_S = 0.005  # seconds between checks whether all stops have ended
 
 

@@ -30,10 +30,10 @@ PACKAGE = __name__.partition(".")[0]
 MOST_NAMES = 20  # limit of the drives that a message names
 CUT_SHORT = "the stops were cut short by a third signal: motors may still be turning"
 REPLACED = (
-    "%s will not stop the drives: the program has set its own handler since. They are stopped when the bus "
-    "is closed or the process exits; open a bus with stop_on_exit in the main thread to take it again"
+    "%s no longer stops the drives, because the program set its own signal handler; closing the bus or "
+    "ending the process still stops them. For a new handler, open a bus with stop_on_exit in the main thread"
 )
-STOPPING = "{} received: stopping {}; Ctrl-C three times within a second gives up"
+STOPPING = "{} received: stopping {}; press Ctrl-C three times within a second to give up"
 
 
 def _ending() -> tuple[signal.Signals, ...]:

@@ -169,7 +169,7 @@ class IdentityCheck:
             make = self._shown(drive, _of_same_register(drive), timed)
             if make is None:
                 raise
-            why = f"{refusal}; it answers as {_described(make)}"
+            why = f"{refusal}; the drive answers as {_described(make)}"
             raise WriteForbidden(why, rule=refusal.rule) from refusal
         except DriveException as refusal:
             kind = drive.title or type(drive).__name__
@@ -197,7 +197,7 @@ class IdentityCheck:
             before = peer.silences
             make = self._shown(drive, makes, timed)
             if make is not None:
-                why = f"nothing is written to {drive.name}: it answers as {_described(make)}"
+                why = f"nothing is written to {drive.name}: the drive answers as {_described(make)}"
                 raise WriteForbidden(why, rule="it shows another make")
             if peer.silences == before:
                 break
@@ -411,7 +411,7 @@ def _is_harmless_in(family: type[Drive], register: Register[Any], count: float) 
 
 
 def _described(make: Make) -> str:
-    return f"{_with_article(make.title)} does; if it is one, declare model {make.model}"
+    return f"{_with_article(make.title)} does. If it is one, declare model = {make.model}"
 
 
 def _with_article(title: str) -> str:
@@ -434,12 +434,12 @@ def _withheld(drive: Drive, why: str, other: Drive | Make | None) -> WriteForbid
     if other is not None:
         attach = f"{type(other).__name__}({drive.address})" if isinstance(other, Drive) else other.model
         way = (
-            f"It answers as {_with_article(other.title)} does. Use the hard-wired stop, or stop it as that: "
-            f"`multidrop stop PORT {other.model} {drive.address}`; in a program detach {drive.name} "
-            f"first, and attach {attach}"
+            f"It answers as {_with_article(other.title)} does. Use the hard-wired stop, or "
+            f"`multidrop stop PORT {other.model} {drive.address}`; in a program, detach {drive.name}, "
+            f"attach {attach} and stop that"
         )
     return WriteForbidden(
-        f"no stop was sent to {drive.name}: another drive is at its address, as two reads showed ({why}); "
-        f"this family's stop may start it. {way}",
+        f"no stop was sent to {drive.name}: two checks found another drive at its address, which this stop "
+        f"may start ({why}). {way}",
         rule=ANOTHER_FAMILY,
     )

@@ -117,8 +117,8 @@ class Ledger:
             since = now - wear.last  # negative if the clock was set back; then the true interval is unknown
             if wear.writes and 0 <= since < least_interval:
                 return (
-                    f"it is kept in EEPROM, was written {since:.0f} s ago and is written once in "
-                    f"{least_interval:.0f} s at most"
+                    f"it is kept in EEPROM and was written {since:.0f} s ago, but only one write in "
+                    f"{least_interval:.0f} s is allowed"
                 )
             if wear.this_year >= self.budget:
                 return (

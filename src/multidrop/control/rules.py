@@ -76,9 +76,7 @@ def check_plain(drive: Drive, register: Register[Any], raw: float) -> None:
     value = register.format(register.decode(raw))
     way = f"which only verbs may do: use {advice.program}"
     if not verbs:
-        way = (
-            "and its class does not say that it is harmless: declare harmless = (…), moves = False, or a verb"
-        )
+        way = "and its class does not declare it harmless: add harmless = (…), moves = False, or a verb"
     raise refused(drive, register, f"{value} commands the motor, {way}", advice if verbs else None)
 
 

@@ -121,7 +121,7 @@ class StopAttempt:
         # a broadcast alone does not end the stop: the drive may not have received it
         is_tried = self.is_sent and self.frame is not None
         if limit is not None and is_tried and now() >= self._begun + limit:
-            reason = f"it was not seen to stop within its {limit:g} s"
+            reason = f"the motor was not seen to stop within {limit:g} s"
             self.failure = self.failure or Unconfirmed(self.drive.name, "the stop", reason)
             return True
         try:
@@ -152,8 +152,8 @@ class StopAttempt:
         if not self.doubt or self._shows_more_than_zeros:
             return None
         reason = (
-            f"it was sent, but {self.doubt}; the registers that would show the motor at rest are all 0, and "
-            "so may be unused registers of another make: look at the motor"
+            f"it was sent, but {self.doubt}. All registers read 0, which may be a motor at rest or another "
+            "maker's drive: look at the motor"
         )
         return Unconfirmed(self.drive.name, "the stop", reason)
 

@@ -550,7 +550,7 @@ def _reach_errors(register: Register[Any], family: Any) -> Iterator[str]:
     limit = read_limit(family, register.table)
     if len(register.reach) > limit:
         shown = f"{len(register.reach)} registers with its scale register {register.scale_register}"
-        yield f"one request reads at most {limit} registers, and these are {shown}"
+        yield f"one request reads at most {limit} registers, but these are {shown}"
         return
     own = {*_addresses(register, register.address), register.scaled_by and register.scaled_by.address}
     between = (address for address in register.reach if address not in own)
@@ -592,6 +592,6 @@ def _group_errors(family: Any, group: Collection[Any], seen: Collection[str]) ->
         yield f"{shown}: these registers span {stop - start} addresses, but one request reads at most {limit}"
     elif not may_be_crossed(family, table, range(start, stop)):
         yield (
-            f"{shown}: between them are addresses that are not declared; "
-            "one request may read across them only if readable_gaps says so"
+            f"{shown}: there are undeclared addresses between these registers; "
+            "declare them in readable_gaps if one request may read across them"
         )

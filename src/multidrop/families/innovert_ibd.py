@@ -243,7 +243,7 @@ class InnovertIBD(Drive):
         """Return a sentence for each of these registers whose value may be 0 although its count is not 0."""
         found = {name: own[name] for name in OF_STATE if isinstance(own.get(name), Register)}
         return [
-            f"{name}: it is 0 only {meaning}: it has no part, offset or scale_register{codes}"
+            f"{name}: it is 0 only {meaning}, so it cannot have a part, offset or scale_register{codes}"
             for name, one in found.items()
             for meaning, step, codes in [OF_STATE[name]]
             if one.part or one.offset or one.scale_register or (step and one.step not in (step, None))

@@ -189,7 +189,7 @@ def _member(register: Register[Any] | None, name: str) -> Any:
 
 def _runs(drive: Drive, why: str) -> WriteForbidden:
     return WriteForbidden(
-        f"nothing is written to {drive.name}: {why}, and parameters are only written while its motor stands; "
+        f"nothing is written to {drive.name}: {why}, and parameters are written only while the motor stands; "
         f"{_STOP.program} first",
         advice=_STOP,
     )
@@ -197,8 +197,8 @@ def _runs(drive: Drive, why: str) -> WriteForbidden:
 
 def _not_known(drive: Drive, why: str) -> WriteForbidden:
     return WriteForbidden(
-        f"nothing is written to {drive.name}: it is not known whether its motor stands: {why}; set its "
-        "parameters on its panel"
+        f"nothing is written to {drive.name}: it is not known whether the motor stands, because {why}. Set "
+        "the parameters on the drive's panel"
     )
 
 

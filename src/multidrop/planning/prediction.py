@@ -419,7 +419,7 @@ class ReadingGain:
         return (
             f"{self.requests} {requests} with {self._declaration()} instead of {self.requests_now}: "
             f"{self.seconds:.3f} s instead of {self.seconds_now:.3f} s; "
-            f"state them if the document allows reading there"
+            f"declare these gaps if the manual allows reads there"
         )
 
     def _declaration(self) -> str:

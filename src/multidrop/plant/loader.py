@@ -362,7 +362,7 @@ def _try_each(
     for key, value in inherited.items():
         if key not in right:  # other keys, such as `silence`, are checked when the drive is created
             continue
-        hint = f" (the line's); add {key} = {right[key]} to this drive"
+        hint = f"; the line has this value, so add {key} = {right[key]} to this drive"
         place.attempt(partial(model, **(least | {key: value})), hint=hint)
 
 
@@ -371,7 +371,9 @@ def _polls(
 ) -> tuple[Polled, ...]:
     if entries is None:
         if not model.readings():
-            place.wrong(f"{model.title or model.__name__} has no readings; say what to poll")
+            place.wrong(
+                f"{model.title or model.__name__} has no readings; name the registers to poll in the key poll"
+            )
         return tuple(Polled(register, every) for register in model.readings())
     found = [_polled(entry, model, every, at) for entry, at in place.inside("poll", entries)]
     named = {polled.register for polled in found if isinstance(polled, Polled)}
@@ -393,14 +395,14 @@ def _polled(
     given = place.check({"register": entry} if isinstance(entry, str) else entry, POLL_KEYS)
     own = duration_of(given, "every", place) if "every" in given else every
     if given.get("register") == "*":
-        place.once(place.steps[:-1], "*", sentence='"*" is there twice; keep it once')
+        place.once(place.steps[:-1], "*", sentence='"*" is in poll twice; remove one')
         return tuple(Polled(register, own) for register in model.readings())
     register = (
         place.attempt(model.register, given["register"], key="register") if "register" in given else None
     )
     if register is None:
         return None
-    place.once(place.steps[:-1], register.name, sentence=f"{register} is polled twice; keep it once")
+    place.once(place.steps[:-1], register.name, sentence=f"{register} is in poll twice; remove one")
     if not register.readable:
         place.wrong(f"{register} can only be written, not polled; see `multidrop models {model.model}`")
         return None

@@ -195,16 +195,16 @@ TWENTY_MISTAKES = [
     "twenty.toml:7: [family]: together: holding = 200 is not a number of registers from 1 to 125",
     'twenty.toml:5: [family]: formats has "7E1", but an RTU frame needs 8 data bits; write "8E1"',
     "twenty.toml:12: [default]: unknown key 'tabel'; did you mean table?",
-    "twenty.toml:15: [reading] speed 1: 'speed 1' cannot be a register's name: it is not letters of a to z, "
-    "digits and _, after a letter; write speed_1",
+    "twenty.toml:15: [reading] speed 1: 'speed 1' cannot be a register's name: it may have letters a to "
+    "z, digits and _, and must begin with a letter; write speed_1",
     "twenty.toml:16: [reading] speed: unknown key 'stepp'; did you mean step?",
     'twenty.toml:17: [reading] voltage: at: "40001" begins with 4, which stands for table holding, but '
     'table = "input"; remove the key table, or write an address of table input',
     "twenty.toml:18: [reading] level: at: 40002 may be the number 40002, or register 2 of table holding; "
-    'write "9C42H" for that number, or "40002" in quotes in the TOML file (in a CSV file without '
-    "counts_from) for that of the table",
+    'write "9C42H" for that number, or "40002" in quotes for the register of the table (in a '
+    "CSV file, remove counts_from)",
     'twenty.toml:19: [reading] power: at: "8192" may be decimal or hex; write 8192, or "8192H"',
-    "twenty.toml:20: [reading] mode: values: on and off are both 0; each has its own",
+    "twenty.toml:20: [reading] mode: values: on and off are both 0; give each its own",
     "twenty.toml:21: [reading] flags: bits: b = 99 is not a bit's number, 0 to 63",
     "twenty.toml:22: [reading] both: values and unit are both given; a register has only one of unit, values "
     "and bits",
@@ -301,7 +301,7 @@ WRONG_KEYS = [  # each text has one wrong key of a register
     ("step = inf", "step = inf: the value is not a finite number; write step = 0.1"),
     ("step = 0", "step = 0: every reading would be 0; write step = 0.1"),
     ("number_format = 'F31'", "number_format = 'F31': the value is not known; did you mean"),
-    ("values = {}", "values is empty; leave it out"),
+    ("values = {}", "values is empty; remove it"),
     (
         "title.de = 'Strom'",
         "title = {'de': 'Strom'}: the language de is unknown, not one of ru, zh; write title.ru",

@@ -102,7 +102,7 @@ def _ambiguous(text: str, number: int) -> str:
     numbered = int(text[1:])
     return (
         f"{text} may be the number {text}, or register {numbered} of table {table}; write {right}, "
-        f'or "{text}" in quotes in the TOML file (in a CSV file without counts_from) for that of the table'
+        f'or "{text}" in quotes for the register of the table (in a CSV file, remove counts_from)'
     )
 
 

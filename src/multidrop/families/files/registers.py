@@ -51,7 +51,7 @@ def unusable(name: str) -> str:
         return ""
     words = re.sub(r"\W+|_+", "_", name, flags=re.ASCII).strip("_").lower()
     right = words if _NAME.fullmatch(words) else f"r_{words}".rstrip("_")
-    return f"it is not letters of a to z, digits and _, after a letter; write {right}"
+    return f"it may have letters a to z, digits and _, and must begin with a letter; write {right}"
 
 
 def enumeration(owner: str, given: Mapping[str, Any]) -> type[IntEnum]:
@@ -75,9 +75,9 @@ def _check(key: str, given: Mapping[str, Any], most: int, allowed: range, right:
 
 def _mistakes(key: str, given: Mapping[str, Any], most: int, allowed: range, right: str) -> Iterator[str]:
     if not given:
-        yield f"{key} is empty; leave it out, or write {key} = {{ off = 0, on = 1 }}"
+        yield f"{key} is empty; remove it, or write {key} = {{ off = 0, on = 1 }}"
     if len(given) > most:
-        yield f"{key} has {len(given)} names, and {most} are the most"
+        yield f"{key} has {len(given)} names, more than the allowed {most}"
         return
     spelt: dict[str, str] = {}
     numbered: dict[int, str] = {}
@@ -87,12 +87,12 @@ def _mistakes(key: str, given: Mapping[str, Any], most: int, allowed: range, rig
         elif name in OF_ENUMERATIONS:
             yield f"{key}: {name!r} is a name that all enumerations have; write {name}_"
         elif name.lower() in spelt:
-            yield f"{key}: {name} and {spelt[name.lower()]} differ in capitals alone; call one otherwise"
+            yield f"{key}: {name} and {spelt[name.lower()]} differ in capitals alone; rename one"
         spelt[name.lower()] = name
         if not is_whole(number) or number not in allowed:
             yield f"{key}: {name} = {number!r} is not {right}"
         elif number in numbered:
-            yield f"{key}: {name} and {numbered[number]} are both {number}; each has its own"
+            yield f"{key}: {name} and {numbered[number]} are both {number}; give each its own"
         else:
             numbered[number] = name
 

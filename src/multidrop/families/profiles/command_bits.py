@@ -125,7 +125,7 @@ class CiA402(Profile):
         for word, state, words in _UP:
             yield from insist(self.control, self._word(word))
             if not (yield from until(partial(self._is_in, state), limit=READY_TIME)):
-                why = f"after {READY_TIME:g} s it is not {words}"
+                why = f"the drive is not {words} after {READY_TIME:g} s"
                 raise NotVerified(self.name, "the start", f"{why}; {self.remote}")
 
     def _is_in(self, state: int) -> Script[bool]:

@@ -73,13 +73,13 @@ def own_errors(
     elif name in taken:
         yield f"{name}: reserved name: every profile has an attribute with this name; rename the register"
     elif register.harmless:
-        yield f"{name}: only control has harmless counts, and the profile states them; leave them out"
+        yield f"{name}: remove harmless: only control has harmless counts, and the profile states them"
     if name == "reference" and (register.span or register.coding.raw_span)[0] < 0:
-        yield f"{name}: a reference below 0 may turn the motor the other way; its span begins at 0"
+        yield f"{name}: a reference below 0 may turn the motor the other way: its span must begin at 0"
     if name == "reference" and ((register.step or 0) < 0 or register.offset):
         yield f"{name}: a greater count must mean more: its step must be above 0, and it has no offset"
     if name == "output_frequency" and (register.part or register.offset or register.scale_register):
-        yield f"{name}: it is 0 only at rest: it has no part, offset or scale_register"
+        yield f"{name}: it is 0 only at rest, so it cannot have a part, offset or scale_register"
     if name == "fault":
         yield from code_errors(register)
 
@@ -87,7 +87,7 @@ def own_errors(
 def code_errors(register: Register[Any]) -> Iterator[str]:
     """Yield an error if this register is not a code, such as a fault's, of which only 0 has value 0."""
     if register.step not in (1, None) or register.offset or register.scale_register:
-        yield f"{register.name}: it is a code: it has no step, offset or scale_register"
+        yield f"{register.name}: it is a code, so it cannot have a step, offset or scale_register"
 
 
 def errors_together(roles: Mapping[str, Role], found: Mapping[str, Any]) -> Iterator[str]:
@@ -117,7 +117,7 @@ def role_errors(name: str, role: Role, register: Register[Any]) -> Iterator[str]
         units = " or ".join(repr(unit) for unit in role.units)
         yield f"{name}: its unit is {register.unit!r}; this profile takes {units}"
     if role.units and register.step is None:
-        yield f"{name}: its step is not stated, so nothing can be computed with it"
+        yield f"{name}: its step must be stated, because the profile computes with it"
     if register.broadcast and role.harmless is not None and not {*register.broadcast} <= {*role.harmless}:
         yield f"{name}: broadcast has counts that are not harmless in this profile"
 
@@ -125,10 +125,10 @@ def role_errors(name: str, role: Role, register: Register[Any]) -> Iterator[str]
 def _word_errors(name: str, role: Role, register: Register[Any]) -> Iterator[str]:
     is_plain = register.number_format is NumberFormat.U16 and register.step == 1 and not register.unit
     if not is_plain or register.table.carrier is not Carrier.WORD:
-        yield f"{name}: it is one word of bits, without a unit and a step"
+        yield f"{name}: it is one word of bits, so it cannot have a unit or a step"
     for fact in ("offset", "part", "invalid", "scale_register"):
         if getattr(register, fact, None):
-            yield f"{name}: it is a whole word, and takes no {fact}"
+            yield f"{name}: it is a whole word, so it cannot have {fact}"
     if register.values is None:
         return
     known = ", ".join(role.extra)
@@ -164,9 +164,9 @@ def _renumbering_errors(name: str, role: Role, values: type[Any]) -> Iterator[st
     elif missing := [one for one in role.renumbered if one not in names]:
         yield f"{name}: the number of {', '.join(missing)} is missing"
     elif len(values) < len(names):
-        yield f"{name}: two of its words have one number"
+        yield f"{name}: two of its words have the same number"
     elif {"jog_forward", "jog_reverse"} & {*names} and "stop_jog" not in names:
-        yield f"{name}: a jog needs the number of stop_jog; add it, or leave the jogs out"
+        yield f"{name}: a jog needs a number for stop_jog; add it, or remove the jogs"
 
 
 def completed(role: Role, register: Register[Any]) -> Register[Any]:
