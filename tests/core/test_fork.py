@@ -379,7 +379,7 @@ def test_an_import_fails_in_a_sub_interpreter_but_not_in_the_main_one() -> None:
     done = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, check=True)
     refused = (
         "multidrop cannot be imported in a sub-interpreter. Import it in the process's main "
-        "use it there, or in a process of its own"
+        "interpreter, or in another process"
     )
     lines = done.stdout.splitlines()
     assert lines[0::2][:3] == [refused] * 3

@@ -234,7 +234,7 @@ def test_a_missing_nats_library_is_named(tmp_path: Path, monkeypatch: pytest.Mon
         monkeypatch.setitem(sys.modules, name, None)
     for name in [name for name in sys.modules if name.startswith("multidrop.fleet")]:
         monkeypatch.delitem(sys.modules, name)
-    with pytest.raises(PlantError, match=r"it needs nats, which is not installed: pip install 'nats-py"):
+    with pytest.raises(PlantError, match=r"the library nats is not installed: pip install 'nats-py"):
         read_settings(written(tmp_path, "[serve.fleet]\n"), {})
 
 

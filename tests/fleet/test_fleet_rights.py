@@ -466,7 +466,7 @@ def test_clocks_an_hour_apart_are_logged_and_harmless(tmp_path: Path) -> None:
     ahead = {"gw-a": {"PYTHONPATH": str(tmp_path / "ahead")}, "gw-b": {}}
     with secured_fleet(tmp_path, 1, ("gw-a", "gw-b"), ahead) as fleet:
         until(
-            lambda: "this machine's clock is 3600 s ahead of that of tls://" in fleet.log("gw-a"),
+            lambda: "this machine's clock is 3600 s ahead of the clock of tls://" in fleet.log("gw-a"),
             "gw-a logs it",
         )
 

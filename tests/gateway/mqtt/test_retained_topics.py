@@ -197,7 +197,7 @@ def test_a_start_that_a_broker_delivers_after_a_stop_is_refused(tmp_path: Path) 
             start()
             assert gateway.post("/api/stop").json["pump-1"]["done"] is True
             broker.signal(signal.SIGCONT)
-            assert told().startswith("not sent: it ")
+            assert told().startswith("not sent: the command ")
             assert not motor.goal
         finally:
             broker.signal(signal.SIGCONT)
