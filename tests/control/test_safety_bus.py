@@ -364,7 +364,9 @@ def test_a_setpoint_loop_to_eeprom_is_refused_with_advice() -> None:
     line, drive, sim = one(DelixiModbus(1))
     drive.set_frequency(10.0)
     for step in range(60):  # once a second for a minute
-        with pytest.raises(WriteForbidden, match=r"once in 60 s at most; change it less often: .*P00\.02"):
+        with pytest.raises(
+            WriteForbidden, match=r"only one write in 60 s is allowed; change it less often: .*P00\.02"
+        ):
             drive.set_frequency(10.1 + 0.1 * (step % 9))
         line.sleep(1.0 - 0.04)
     assert sim.counters.eeprom_writes["frequency"] == 1

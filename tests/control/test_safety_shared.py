@@ -377,7 +377,7 @@ def test_another_client_s_setpoint_is_seen_before_the_start() -> None:
     with shared_line("invt-che", seed=3) as (drive, pair, received), Bus(pair.theirs) as other:
         set_frequency(drive, 20)
         set_frequency(other.attach(InvtCHE(1, maximum_frequency=50)), 50)
-        with pytest.raises(WriteForbidden, match=r"holds 100\.00 % and not 40\.00 %"):
+        with pytest.raises(WriteForbidden, match=r"setpoint 100\.00 %, not the written 40\.00 %"):
             drive.start()
         assert not received[0].starts
 
