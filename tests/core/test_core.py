@@ -273,6 +273,7 @@ def test_the_next_exchange_is_reported_when_repeated_exchanges_are_replaced(port
 
 def test_queued_exchanges_are_carried_out_between_repeated_exchanges(port: Port, rows: Rows) -> None:
     port.repeat([read(0)])
+    rows.of("value", 1)
     queued, due_ns = [read(1), read(2)], now_ns() + 20_000_000
     port.submit(queued, [due_ns, due_ns])
     wait_until(lambda: not pending(port))
