@@ -32,7 +32,7 @@ from multidrop.supervisor import supervisor
 
 COMMAND_S = 60.0  # a command that takes longer is reported as hanging (a stop may take 30 s)
 TURN_S = 0.2  # s; how long each stop may block the event loop, if no thread can be started
-AGAIN_S = 0.2  # s; pause between two stops in the event loop, for its other work
+AGAIN_S = 0.2  # s; pause between two such stops, so that the event loop can do other work
 STOP_S = 30.0  # s; how long the event loop repeats stops, if no thread can be started
 # Seconds. After a client's stop command, an unconfirmed stop is repeated for at least this time.
 REPEATED_S = 30.0

@@ -586,7 +586,7 @@ class WriteRecords:
 def _way_out(
     drive: Drive, register: Register[Any], kept: Kept, *, is_yearly: bool
 ) -> tuple[str, Advice | None]:
-    """Return a hint on how to set a register whose write the ledger has refused, and an Advice or None."""
+    """Return a sentence on how to set a register although the ledger refuses its writes; and an Advice."""
     if kept is Kept.UNKNOWN:
         declared = f'ram = ["{register.name}"]'
         written = f"write {declared} below its [[line.drive]]"

@@ -88,7 +88,7 @@ def _has(drive: Drive, name: str) -> bool:
 
 
 def check_broadcast(drive: Drive, register: Register[Any], raw: float) -> None:
-    """Raise WriteForbidden unless this is a stop, or the drive needs no option `confirmed`, or has it set."""
+    """Raise WriteForbidden if a drive lacks the option `confirmed` that this write needs. Stops never do."""
     if not is_stop(drive, register, raw):
         drive.check_confirmed(register.name)
 

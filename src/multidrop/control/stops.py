@@ -42,8 +42,7 @@ LEAST_S = 30.0  # s; how long a stop is repeated by default
 PAUSE_S = 0.2  # s; pause before a stop is repeated
 LOOK_S = 0.002  # s; pause between checks whether a poller has reopened a lost port
 AT_ONCE = 8  # after this many steps without a good reply, a stop shares the line with polling
-# After a step without a good reply, a stop leaves the line to polling for SHARE times the step's duration.
-SHARE = 1.5
+SHARE = 1.5  # polling then gets the line for this many times the duration of the stop's last step
 MOST_STEPS = 8  # limit of script steps when an interrupted stop is sent once more
 UNSENT = (WriteForbidden, LineError, NotMaster, ValueError)
 WORTH_REPEATING = (Unconfirmed, NotVerified, NoReply, BadReply, DriveException, PortLost, NotMaster)

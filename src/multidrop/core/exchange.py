@@ -257,7 +257,7 @@ class Counters(NamedTuple):
     ideal_ns: int = 0
     longest_ns: int = 0  # ns; longest response delay
     timeout_ns: int = 0  # ns; usual timeout of a read
-    ended: Counter[Status] = Counter()  # exchanges without a reply, by status; broadcasts count as OK
+    ended: Counter[Status] = Counter()  # exchanges without a reply, by status; OK: broadcasts
     missed: Counter[Status] = Counter()  # number of missing values, by status
     refused: Counter[int] = Counter()  # number of values missing because of an exception, by its code
     delays: Counter[int] = Counter()  # number of replies in each bucket of the histogram of response delays

@@ -197,7 +197,7 @@ class PortQueue:
         self._done = done
 
     def keep_busy(self, port: Port, now_ns: int) -> None:
-        """Let the core repeat the bus cycle if possible; otherwise queue the next exchanges."""
+        """Let the C core repeat the bus cycle if possible; otherwise queue the next exchanges."""
         cycle = self._schedule.cycle(now_ns)
         if cycle != self._cycle or port.repeating != bool(cycle):
             self.pause(port)

@@ -255,7 +255,7 @@ class BatchDecoder:
 def _parts(batch: FlatTable, body: memoryview, count: int) -> tuple[int, list[bytes]]:
     """Return the number of rows of a batch, and copies of its buffers. There must be `count` buffers."""
     if batch.table(3):
-        raise ValueError("its batches are compressed: only pyarrow and polars can read them")
+        raise ValueError("the recording is compressed: only pyarrow and polars can read it")
     rows, places = batch.number(0, "<q"), batch.pairs(2)
     if not 0 <= rows <= len(body):  # a larger `rows` could overflow the sums below
         raise ValueError(f"a batch states {rows} rows, but has only {len(body)} bytes")

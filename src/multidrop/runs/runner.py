@@ -141,7 +141,7 @@ class TestRun:
     def _check_speed(self, poller: Poller) -> None:
         if self._speed != 1.0 and not all(map(_is_simulated, poller.buses.values())):
             raise ValueError(
-                "argument 'speed' changes simulated time, but a port of the plant is not simulated: remove it"
+                "argument 'speed' is only for simulated ports, and this plant has another port; leave it out"
             )
 
 

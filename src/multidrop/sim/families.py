@@ -515,7 +515,7 @@ class SimulatedYD1000(MotorDrive):
 
     def _control(self, word: int) -> None:
         direction = -1 if word & YD_REVERSE else 1
-        if not word & YD_COMMANDED:  # without bit 15, the other bits have no effect (8.1)
+        if not word & YD_COMMANDED:  # without bit 15, the other bits have no effect (manual, section 8.1)
             panel = self.motor.run if self.panel_runs else self.motor.stop
             panel()
         elif word & YD_RESET:

@@ -352,9 +352,9 @@ class PreparedReads:
         self.answered: set[Block] = set()
 
     def ask_first(self, block: Block) -> None:
-        """From now on read a refused block before the other parts of its larger block.
+        """Read this block, which the drive has refused, first when a read is split into several requests.
 
-        Without this block's values the whole read fails, so reading the other parts first wastes bus time.
+        If the drive refuses it again, the whole read fails, and the other requests would waste bus time.
         """
         for whole, parts in [*self.parts.items()]:
             if block in parts:

@@ -428,7 +428,7 @@ def _look_for_trip(watched: _WatchedDrive) -> None:
 
 
 def _turns_since(watched: _WatchedDrive, since_ns: int) -> bool:
-    """Return True if all values that show whether the motor turns were requested after this time."""
+    """Return True if the newest status and frequencies of the drive were requested after this time."""
     cells = [cell for name in ("status", *FREQUENCIES) if (cell := watched.cells.get(name)) and cell.good]
     return all(cell.good[1] > since_ns for cell in cells if cell.good)
 

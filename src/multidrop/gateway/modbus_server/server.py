@@ -190,7 +190,7 @@ class ModbusClient(asyncio.Protocol):
         self._came.clear()
 
     def _answer_some(self) -> bool:
-        """Answer at most SLICE requests, for `RoundShare.slice_s`. Return True if more can be answered."""
+        """Answer up to SLICE requests within `RoundShare.slice_s` seconds. Return True if more wait."""
         begun = self._port.clock()
         answers: list[bytes] = []
         for _ in range(SLICE):

@@ -65,10 +65,10 @@ def is_fresh(row: Newest | None, now_ns: int, since_ns: int = 0) -> bool:
 
 
 def is_certain(register: Register[Any]) -> bool:
-    """Return True if a value of this register determines the words that the drive sent.
+    """Return True if the words that the drive sent can be computed from the register's value.
 
-    This is not so for a register with only a part of a word, with a scale in another register, or with one of
-    the number formats in _OPEN.
+    They cannot if the register is a part of a word, if another register holds its scale, or if its number
+    format is one of _OPEN.
     """
     coding = register.coding
     return register.part is None and not register.scale_register and coding.number_format not in _OPEN
