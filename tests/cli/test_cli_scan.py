@@ -118,7 +118,7 @@ def test_a_scan_without_findings_returns_1_and_writes_no_file(run: Run, port: st
 def test_a_scan_of_a_serial_server_needs_its_baud_rate(run: Run, port: str) -> None:
     status, _, err = run("scan", port, "--quick")
     assert status == 2
-    assert "name this rate, such as --baudrates 9600" in err
+    assert "Give the server's rate, such as --baudrates 9600" in err
     status, out, _ = run("scan", port, "--baudrates", "9600", "--addresses", "1-2", *TWO_MODELS)
     assert status == 0
     assert "address 1: invt-che" in out

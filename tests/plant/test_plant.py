@@ -432,7 +432,8 @@ def test_all_mistakes_in_a_plant_file_are_reported_together(mistakes: Mistakes) 
         ),
         (
             HEAD.replace("/dev/a", "socket://10.0.0.9") + TOY,
-            'line "L": socket://10.0.0.9: the URL needs a host and a port number, such as socket://10.0.0.7:4001',
+            'line "L": socket://10.0.0.9: the URL needs a host and a port number, '
+            "such as socket://10.0.0.7:4001",
         ),
     ],
 )
