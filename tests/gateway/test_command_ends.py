@@ -60,7 +60,7 @@ class UnopenedLines:
     ],
     ids=["a write", "a verb", "a stop", "a stop of all"],
 )
-def test_the_end_time_of_the_last_command_is_known(command: Callable[[Commands], Any]) -> None:
+def test_the_end_time_of_the_last_command_to_a_drive_is_stored(command: Callable[[Commands], Any]) -> None:
     commands = Commands(UnopenedLines(), MAY)
     assert commands.ended_ns("mill") == 0
     begun_ns = time.monotonic_ns()
@@ -76,7 +76,7 @@ def test_the_end_time_of_the_last_command_is_known(command: Callable[[Commands],
     ],
     ids=["a write", "a verb"],
 )
-async def test_the_result_of_a_command_names_a_drive_that_was_removed_from_its_line(
+async def test_the_error_of_a_command_names_the_removed_drive(
     command: Callable[[Commands], Awaitable[CommandResult]],
 ) -> None:
     told = await command(Commands(UnopenedLines(), MAY))
@@ -109,7 +109,7 @@ async def test_a_refused_command_has_no_end_time() -> None:
 
 
 @pytest.mark.parametrize("verb", ["stop", "coast"])
-async def test_only_stops_accept_another_unicode_spelling(verb: str) -> None:
+async def test_only_stops_accept_another_unicode_spelling_of_a_drive_name(verb: str) -> None:
     """A u with two dots is one character (U+00FC) on some keyboards, and two (U+0075 U+0308) on others."""
     fan, spelt = "L\u00fcfter", "Lu\u0308fter"
     line, known, _ = one(InvtCHE(1, name=fan, maximum_frequency=50))
@@ -129,7 +129,7 @@ async def test_only_stops_accept_another_unicode_spelling(verb: str) -> None:
     assert commands.stopped_ns(fan) is not None
 
 
-async def test_the_view_of_a_drive_is_found_by_another_unicode_spelling(tmp_path: Path) -> None:
+async def test_the_view_of_a_drive_is_found_by_another_unicode_spelling_of_its_name(tmp_path: Path) -> None:
     gateway: Any = SimpleNamespace(
         plant=plant_of(("hall", InvtCHE(1, name="L\u00fcfter"))),
         ledger=Ledger(tmp_path / "wear.sqlite"),
@@ -162,7 +162,7 @@ above = 10
 
 
 @pytest.mark.slow
-def test_computed_channels_are_on_the_page_and_in_metrics_and_in_mqtt(tmp_path: Path) -> None:
+def test_computed_channels_appear_on_the_page_in_metrics_and_in_mqtt(tmp_path: Path) -> None:
     with served(tmp_path, CHANNELS) as gateway:
         until(lambda: gateway.frame()["drives"]["pump-2"]["values"]["half"][0] == 25.0)
         drive = gateway.get("/api/plant").json["lines"][0]["drives"][1]
@@ -223,7 +223,7 @@ def test_modbus_clients_read_computed_channels_as_floats() -> None:
 
 
 @pytest.mark.parametrize("channels", [0xF00E, 0xFFFE, 0x3003])
-def test_modbus_addresses_of_computed_channels_must_not_overlap_others(channels: int) -> None:
+def test_overlapping_modbus_addresses_of_computed_channels_are_reported(channels: int) -> None:
     (sentence,) = ModbusSettings(channels=channels).check(with_channels())
     assert sentence.startswith("mill: the 4 words of its channels do not fit at ")
     assert ModbusSettings(channels=channels).check(plant_of(("hall", InvtCHE(1, name="mill")))) == []

@@ -57,7 +57,7 @@ def calling(gateway: Served) -> socket.socket:
 @pytest.mark.parametrize(
     ("path", "body"), [("/api/stop", {"drives": None}), ("/api/act", {"drive": "pump-1", "verb": "coast"})]
 )
-def test_the_head_of_the_http_answer_arrives_while_a_stop_is_in_progress(
+def test_http_answer_headers_are_sent_while_a_stop_is_in_progress(
     gateway: Served, monkeypatch: pytest.MonkeyPatch, path: str, body: dict[str, object]
 ) -> None:
     """Until the head arrives, the web page assumes that the gateway has not accepted the stop."""
@@ -81,7 +81,9 @@ def test_the_head_of_the_http_answer_arrives_while_a_stop_is_in_progress(
     connection.close()
 
 
-def test_a_stop_continues_without_its_client(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_continues_after_its_client_disconnects(
+    gateway: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
     ends: list[str] = []
     held = threading.Event()
 
@@ -154,7 +156,9 @@ def gateway(tmp_path: Path) -> Iterator[Served]:
 @pytest.mark.long
 @pytest.mark.slow
 @table("body", UNREADABLE.values(), ids=UNREADABLE)
-def test_an_unreadable_stop_stops_all(gateway: Served, monkeypatch: pytest.MonkeyPatch, body: bytes) -> None:
+def test_a_stop_with_an_unreadable_body_stops_all_drives(
+    gateway: Served, monkeypatch: pytest.MonkeyPatch, body: bytes
+) -> None:
     monkeypatch.setattr(messages, "STOP_BODY_S", 0.1)
     with calling(gateway) as client:
         gateway.start("pump-1", "pump-2")
@@ -169,7 +173,7 @@ def test_an_unreadable_stop_stops_all(gateway: Served, monkeypatch: pytest.Monke
 
 @pytest.mark.slow
 @table("drives", ["pump-1", ["pump-1"], ["pump-1", "\ud800", "\x1b[2J\n", "PUMP-2", "", "pump-9"]])
-def test_a_stop_stops_the_drives_that_it_names(gateway: Served, drives: str | list[str]) -> None:
+def test_a_stop_stops_only_the_named_drives(gateway: Served, drives: str | list[str]) -> None:
     """Names of other drives: a lone surrogate, an escape sequence for terminals, a name in capitals."""
     gateway.start("pump-1", "pump-2")
     told = gateway.post("/api/stop", {"drives": drives}).json
@@ -212,7 +216,7 @@ def test_a_stop_by_a_client_without_the_right_to_stop_is_not_sent(tmp_path: Path
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_broken_parts")
-def test_a_stop_works_while_all_gateway_parts_fail(tmp_path: Path) -> None:
+def test_a_stop_works_while_mqtt_and_history_fail(tmp_path: Path) -> None:
     with served(tmp_path, BROKEN) as gateway:
         assert isinstance(gateway.gateway.feeds["mqtt"], BrokenFeed)
         gateway.start("pump-1", "pump-2")
@@ -285,7 +289,7 @@ def test_a_stop_does_not_wait_for_hanging_writes(gateway: Served, monkeypatch: p
 
 
 @pytest.mark.slow
-def test_commands_called_before_a_stop_are_not_sent_after_it(gateway: Served) -> None:
+def test_waiting_commands_are_not_sent_after_a_later_stop(gateway: Served) -> None:
     """The thread of each command starts only after the stop was called."""
     begun: list[threading.Thread] = []
 
@@ -341,7 +345,7 @@ def test_many_stops_of_a_silent_drive_do_not_delay_the_stop_of_another(gateway: 
 
 
 @pytest.mark.slow
-def test_one_of_nine_coast_commands_is_repeated_and_the_others_are_not(
+def test_only_one_of_nine_coast_commands_is_repeated_to_a_silent_drive(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     repeated: list[float | None] = []
@@ -365,7 +369,7 @@ def test_one_of_nine_coast_commands_is_repeated_and_the_others_are_not(
 
 
 @pytest.mark.long
-def test_a_stop_of_a_motor_that_was_started_again_is_sent_as_a_new_stop(gateway: Served) -> None:
+def test_a_new_stop_is_sent_if_a_stopped_motor_was_started_again(gateway: Served) -> None:
     """The first stop is still repeated to the silent drive, but has ended for the other."""
     with ThreadPoolExecutor(1) as caller:
         gateway.start("pump-1", "pump-2")
@@ -421,7 +425,9 @@ def test_verbs_and_writes_are_answered_with_their_results(gateway: Served) -> No
     )
 
 
-def test_without_an_audit_log_only_stops_are_sent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_stops_are_sent_if_the_audit_log_cannot_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def fail(log: AuditLog, *record: object) -> None:
         raise OSError(ENOSPC, "No space left on device")
 

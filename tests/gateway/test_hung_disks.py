@@ -95,7 +95,7 @@ def reload_as(gateway: Served, serve: str) -> Any:
     return gateway.post("/api/reload", {"confirm": True}, **gateway.writer).json
 
 
-def test_a_history_on_a_hanging_disk_starts_when_the_disk_answers(tmp_path: Path, fifos: Fifos) -> None:
+def test_the_history_starts_when_a_hanging_disk_answers(tmp_path: Path, fifos: Fifos) -> None:
     fifos.put(tmp_path / "kept" / "rows.00000001.arrows")
     with served(tmp_path, SERVE + HISTORY) as gateway:
         assert_stops_and_polls(gateway)
@@ -108,7 +108,7 @@ def test_a_history_on_a_hanging_disk_starts_when_the_disk_answers(tmp_path: Path
         assert gateway.get("/api/history?series=pump-1.status&from=0&to=1").status == 200
 
 
-def test_a_history_whose_disk_hangs_during_a_reload_does_not_delay_it(tmp_path: Path, fifos: Fifos) -> None:
+def test_reload_continues_while_the_history_disk_hangs(tmp_path: Path, fifos: Fifos) -> None:
     fifos.put(tmp_path / "kept" / "rows.00000001.arrows")
     with served(tmp_path, SERVE) as gateway:
         assert reload_as(gateway, SERVE + HISTORY)["done"] is True
@@ -121,7 +121,7 @@ def test_a_history_whose_disk_hangs_during_a_reload_does_not_delay_it(tmp_path: 
         assert gateway.gateway.feeds == {}  # the second plant file has no [serve.history]
 
 
-def test_a_history_that_fails_to_start_after_a_hang_is_reported_as_dead(tmp_path: Path, fifos: Fifos) -> None:
+def test_health_reports_a_failed_start_of_the_history_after_a_disk_hang(tmp_path: Path, fifos: Fifos) -> None:
     fifos.put(tmp_path / "kept" / "rows.00000001.arrows")
     with served(tmp_path, SERVE + HISTORY) as gateway, pytest.MonkeyPatch.context() as patch:
         patch.setattr(historian, "History", fail)
@@ -162,7 +162,7 @@ def test_a_hanging_disk_of_the_history_is_reported(tmp_path: Path, monkeypatch: 
         go_on.set()
 
 
-def test_a_hanging_export_allows_the_shutdown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_gateway_ends_although_an_export_hangs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     go_on, begun = threading.Event(), threading.Event()
 
     def pieces() -> Iterator[bytes]:
@@ -182,7 +182,7 @@ def test_a_hanging_export_allows_the_shutdown(tmp_path: Path, monkeypatch: pytes
     go_on.set()
 
 
-def test_a_plant_file_that_hangs_fails_only_its_reload(
+def test_only_the_reload_fails_if_reading_the_plant_file_hangs(
     tmp_path: Path, fifos: Fifos, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with served(tmp_path, SERVE) as gateway:
@@ -204,7 +204,7 @@ def test_a_plant_file_that_hangs_fails_only_its_reload(
         until(lambda: health(gateway)["status"] == "ok")
 
 
-def test_a_reload_does_not_wait_for_an_earlier_reload_that_hangs(tmp_path: Path, fifos: Fifos) -> None:
+def test_a_reload_works_while_an_earlier_reload_hangs(tmp_path: Path, fifos: Fifos) -> None:
     with served(tmp_path, SERVE) as gateway:
         path, good = gateway.gateway.plant.path, gateway.gateway.plant.path.read_text()
         fifos.put(path)
@@ -220,7 +220,9 @@ def test_a_reload_does_not_wait_for_an_earlier_reload_that_hangs(tmp_path: Path,
         (tmp_path / "hangs").rename(path)
 
 
-def test_a_hanging_log_allows_stops(tmp_path: Path, fifos: Fifos, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stops_are_sent_while_the_audit_log_hangs(
+    tmp_path: Path, fifos: Fifos, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for module in (settings, gateway_module):
         monkeypatch.setattr(module, "AUDIT_S", SHORT_S)
     fifos.put(tmp_path / "audit.jsonl")
@@ -247,7 +249,9 @@ def test_a_reload_fails_without_changes_if_the_audit_log_hangs(
         assert_stops_and_polls(gateway)
 
 
-def test_a_hanging_ledger_and_audit_log_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hanging_reads_of_the_eeprom_ledger_and_audit_log_are_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     go_on = threading.Event()
 
     def wait(*given: object) -> list[Any]:
@@ -269,7 +273,7 @@ def test_a_hanging_ledger_and_audit_log_are_reported(tmp_path: Path, monkeypatch
 
 
 @pytest.mark.long
-def test_page_files_on_a_hanging_disk_delay_no_other_request(
+def test_other_requests_are_answered_while_reads_of_page_files_hang(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     go_on, read = threading.Event(), Path.read_bytes
@@ -293,7 +297,7 @@ def test_page_files_on_a_hanging_disk_delay_no_other_request(
 
 
 @pytest.mark.long
-def test_sigterm_ends_a_gateway_whose_disks_hang(tmp_path: Path, fifos: Fifos) -> None:
+def test_sigterm_ends_the_gateway_while_disks_hang(tmp_path: Path, fifos: Fifos) -> None:
     fifos.put(tmp_path / "kept" / "rows.00000001.arrows")
     with simulated_plant(tmp_path, SERVE + HISTORY) as path, serving(path) as (process, _):
         fifos.put(path)
@@ -386,7 +390,7 @@ def dropped(gateway: Served) -> float:
 
 
 @pytest.mark.long
-def test_a_full_disk_interrupts_neither_polling_nor_a_stop(disk: Path, tmp_path: Path) -> None:
+def test_polling_and_stops_continue_while_the_disk_is_full(disk: Path, tmp_path: Path) -> None:
     with served(tmp_path, ON_DISK) as gateway:
         gateway.await_state("pump-2", "stands")
         history = gateway.gateway.feeds["history"]

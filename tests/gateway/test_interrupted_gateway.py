@@ -67,7 +67,7 @@ def falls_silent(drive: Counting) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("step", first_in_ci(151, 53))
-def test_a_gateway_interrupted_at_any_bytecode_ends(drive: Counting, tmp_path: Path, step: int) -> None:
+def test_a_gateway_ends_if_interrupted_at_any_bytecode(drive: Counting, tmp_path: Path, step: int) -> None:
     """Raise KeyboardInterrupt before every `step`th bytecode of the main thread, from start to end."""
     plant = Plant.load(tmp_path / "plant.toml")
 
@@ -120,7 +120,7 @@ def started(path: Path, number: int, *delays: float) -> BoundProcess[str]:
     [(signal.SIGINT, None), (signal.SIGTERM, 0.0), (signal.SIGINT, 0.02), (signal.SIGTERM, 0.2)],
 )
 @pytest.mark.parametrize("stride", first_in_ci(3, 1))
-def test_a_signal_at_any_moment_ends_the_command(
+def test_serve_ends_after_a_signal_at_any_moment(
     tmp_path: Path, number: int, again: float | None, stride: int
 ) -> None:
     """A second signal ends the command at once."""

@@ -198,7 +198,7 @@ def drives(prometheus: Prometheus) -> set[str]:
 
 @pytest.mark.slow
 @pytest.mark.long
-def test_prometheus_scrapes_each_second_and_values_of_a_silent_drive_are_stale(tmp_path: Path) -> None:
+def test_prometheus_marks_values_of_a_silent_drive_as_stale(tmp_path: Path) -> None:
     with served(tmp_path, '[serve]\ntokens = "tokens"\n[serve.may]\nlook = "token"\n') as gateway:
         jobs = JOBS.format(port=gateway.gateway.port, secret=gateway.secrets[Right.LOOK])
         with scraping(tmp_path, jobs) as prometheus:
@@ -334,7 +334,7 @@ def rule_test(series: dict[str, str], alert: str, count: int) -> dict[str, Any]:
 
 
 @pytest.mark.slow
-def test_each_alert_fires_for_its_own_series_and_not_for_normal_series(tmp_path: Path) -> None:
+def test_each_prometheus_alert_fires_only_for_its_own_problem(tmp_path: Path) -> None:
     program = require_program("promtool")
     assert {*FIRING} == {name for name, _ in alerts()}
     tests = [rule_test(series, alert, 1) for alert, series in FIRING.items()]

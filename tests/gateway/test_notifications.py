@@ -79,7 +79,7 @@ class Clocked:
         return pause_s
 
 
-def test_each_start_and_end_of_a_thousand_alarms_is_sent_as_one_message() -> None:
+def test_one_message_is_sent_for_each_start_and_end_of_an_alarm() -> None:
     target, alarms = Clocked(), flaps(1000)
     part = Notifications([target.sender], [FAULT])
     for alarm in alarms:
@@ -118,7 +118,7 @@ def test_a_restart_does_not_repeat_notifications() -> None:
     assert [one["event"] for one in target.messages] == ["end"]
 
 
-def test_the_newest_message_beyond_the_hourly_limit_is_sent_when_allowed() -> None:
+def test_the_newest_notification_is_sent_when_the_hourly_limit_allows_it() -> None:
     target = Clocked(most=60)
     for alarm in (*flaps(100), BEGUN._replace(time=100)):
         target.sender.put(alarm)
@@ -150,7 +150,7 @@ def test_a_failed_message_is_sent_again_after_growing_pauses() -> None:
     assert (len(target.messages), target.sender.problem) == (1, "")
 
 
-def test_a_notification_that_its_target_refuses_for_good_does_not_block_later_ones() -> None:
+def test_later_notifications_are_sent_after_one_is_refused_for_good() -> None:
     target = Clocked()
     target.sender.put(BEGUN)
     target.failure = ValueError("no JSON")
@@ -163,7 +163,7 @@ def test_a_notification_that_its_target_refuses_for_good_does_not_block_later_on
     ]
 
 
-def test_a_notification_that_is_queued_just_before_the_shutdown_is_sent() -> None:
+def test_a_notification_is_sent_if_queued_just_before_the_shutdown() -> None:
     target = Clocked()
     thread = threading.Thread(target=target.sender.run)
     thread.start()
@@ -217,7 +217,7 @@ def webhook() -> Iterator[SimpleNamespace]:
 
 
 @pytest.mark.parametrize("status", [302, 404, 500])
-def test_a_webhook_gets_json_and_its_refusal_is_an_error(webhook: SimpleNamespace, status: int) -> None:
+def test_a_webhook_gets_json_and_an_error_status_raises(webhook: SimpleNamespace, status: int) -> None:
     send = sender_to(AlarmTarget("target", webhook.url))
     send(described(BEGUN, 0))
     webhook.status = status
@@ -248,7 +248,7 @@ def test_a_refused_connection_of_a_webhook_is_reported_in_one_sentence() -> None
             send(described(BEGUN, 0))
 
 
-def test_an_answer_of_a_webhook_that_is_not_http_is_reported_in_one_sentence() -> None:
+def test_a_webhook_answer_in_another_protocol_is_reported_in_one_sentence() -> None:
     def answer() -> None:
         peer, _ = listener.accept()
         with peer:
@@ -263,7 +263,7 @@ def test_an_answer_of_a_webhook_that_is_not_http_is_reported_in_one_sentence() -
         thread.join()
 
 
-def test_waiting_for_an_answer_that_arrives_byte_by_byte_has_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_webhook_times_out_if_its_answer_arrives_byte_by_byte(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sending, "SEND_S", 0.1)
     ends = time.monotonic() + PATIENCE
 
@@ -294,7 +294,9 @@ def test_waiting_for_an_answer_that_arrives_byte_by_byte_has_a_limit(monkeypatch
         ("# https://hooks.example/T0K3N", "has no target"),
     ],
 )
-def test_the_error_about_an_invalid_target_hides_its_secret(tmp_path: Path, line: str, sentence: str) -> None:
+def test_the_error_about_an_invalid_notification_target_shows_no_secret(
+    tmp_path: Path, line: str, sentence: str
+) -> None:
     (tmp_path / "targets").write_text(f"{line}\n")
     found, [mistake] = read_targets(tmp_path / "targets")
     assert (found, sentence in mistake, "T0K3N" in mistake) == ([], True, False)
@@ -351,7 +353,7 @@ def test_faults_and_exceeded_limits_are_sent_as_messages(tmp_path: Path, webhook
     assert found["pump-1", "fault"] in ("overcurrent while accelerating (OC1)", "it shows a fault")
 
 
-def test_alarms_left_out_while_a_message_is_sent_are_counted_in_the_next_one() -> None:
+def test_the_next_notification_counts_the_messages_left_out() -> None:
     target = Clocked()
     send = target.sender._send
 

@@ -89,7 +89,7 @@ def two_lines(
 
 
 @pytest.mark.slow
-def test_a_plant_file_with_mistakes_changes_nothing(tmp_path: Path) -> None:
+def test_a_reload_changes_nothing_if_the_plant_file_has_mistakes(tmp_path: Path) -> None:
     with served(tmp_path) as gateway:
         revision = gateway.gateway.revision
         gateway.await_state("pump-2", "stands")
@@ -177,7 +177,7 @@ def test_a_reload_adds_and_removes_drives_and_keeps_unchanged_lines(tmp_path: Pa
 
 
 @pytest.mark.slow
-def test_a_port_that_is_missing_after_a_reload_is_reported(tmp_path: Path) -> None:
+def test_a_missing_port_is_reported_after_a_reload(tmp_path: Path) -> None:
     with two_lines(tmp_path) as (gateway, _):
         roof = gateway.gateway.plant.lines[1].port
         edit(gateway, roof, str(tmp_path / "nosuch"))
@@ -215,7 +215,7 @@ def test_a_reload_applies_changed_rights_and_host_names(tmp_path: Path) -> None:
         assert write("pump-2").json["done"] is True
 
 
-def test_local_clients_get_no_rights_from_a_reload_that_needs_a_restart(tmp_path: Path) -> None:
+def test_a_reload_grants_no_rights_while_a_proxy_setting_needs_a_restart(tmp_path: Path) -> None:
     with served(tmp_path, "[serve]\nbehind_proxy = false\n") as gateway:
         edit(gateway, "behind_proxy = false\n", f"behind_proxy = true\n{MAY}")
         assert reload(gateway)["restart"] == ["behind_proxy of [serve] takes effect after a restart"]
@@ -392,7 +392,9 @@ def held_up(monkeypatch: pytest.MonkeyPatch) -> tuple[threading.Event, threading
 
 @pytest.mark.slow
 @pytest.mark.parametrize("way", ["stop", "coast"])
-def test_a_stop_does_not_await_new_ports(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str) -> None:
+def test_a_stop_is_sent_while_a_reload_opens_another_port(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str
+) -> None:
     """The drive has been replaced already, and the port of another line is still being opened."""
     verbs = '"fan-1.start", "fan-1.coast"'
     may = MAY.replace("pump-1", "fan-1").replace('"fan-1.start"', verbs)
@@ -505,7 +507,7 @@ def test_a_stop_in_progress_continues_during_a_reload(tmp_path: Path) -> None:
         assert gateway.gateway.revision == revision + 1
 
 
-def test_a_failed_reload_does_not_prevent_the_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_reload_works_after_a_failed_reload(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class Deaf(BrokenFeed):
         def adopt(self, plant: Plant) -> None:
             raise RuntimeError("no plant")

@@ -115,7 +115,9 @@ def test_a_reload_is_cancelled_if_a_server_of_the_gateway_cannot_start(
 
 
 @pytest.mark.slow
-def test_a_part_that_loses_its_port_is_reported(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_modbus_port_lost_during_a_failed_reload_is_reported(
+    gateway: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The reload fails. Meanwhile, another program has opened the previous port of the Modbus server."""
     first = free_port()
     assert reload(gateway, MODBUS.format(first, 21))["done"] is True
@@ -139,7 +141,9 @@ def test_a_part_that_loses_its_port_is_reported(gateway: Served, monkeypatch: py
 
 
 @pytest.mark.slow
-def test_a_slow_part_does_not_delay_a_stop(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_is_sent_while_a_reload_waits_for_the_history(
+    gateway: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
     opens, goes_on = threading.Event(), threading.Event()
     build = parts_module.build
 
@@ -256,7 +260,9 @@ NEW_FAN = InvtCHE(2, name="fan")
 
 
 @pytest.mark.parametrize("names", [["fan"], None])
-async def test_a_new_drive_is_stopped_while_its_predecessor_is_being_stopped(names: list[str] | None) -> None:
+async def test_a_new_drive_is_stopped_while_the_replaced_drive_is_being_stopped(
+    names: list[str] | None,
+) -> None:
     """The stop of the replaced drive may take half a minute, for example if that drive is silent."""
     silent = asyncio.Event()
     lines = Lines(plant_of(PUMP, FAN), held={FAN.address: silent})
@@ -272,7 +278,7 @@ async def test_a_new_drive_is_stopped_while_its_predecessor_is_being_stopped(nam
     assert lines.begun.count(NEW_FAN) == 1
 
 
-async def test_a_stop_that_fails_while_a_reload_changes_lines_is_sent_again() -> None:
+async def test_a_stop_is_sent_again_if_it_fails_during_a_reload() -> None:
     silent = asyncio.Event()
     lines = Lines(plant_of(PUMP, FAN), held={FAN.address: silent}, failing={FAN.address})
     stopping = asyncio.create_task(stop_meant(lines, ["fan"], lines.stop))
@@ -283,7 +289,7 @@ async def test_a_stop_that_fails_while_a_reload_changes_lines_is_sent_again() ->
     assert lines.begun == [FAN, FAN]
 
 
-async def test_a_drive_that_a_reload_adds_is_stopped_as_soon_as_it_is_attached() -> None:
+async def test_a_stop_reaches_a_drive_as_soon_as_a_reload_adds_it() -> None:
     """The name may have another Unicode spelling. Drives of the present plant are not stopped."""
     new = InvtCHE(2, name="L\u00fcfter")
     lines = Lines(plant_of(PUMP, FAN), plant_of(new, FAN))

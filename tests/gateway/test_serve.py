@@ -106,7 +106,7 @@ def test_sighup_reloads_the_plant_file_and_notifies_systemd(tmp_path: Path) -> N
     assert "the plant file is in effect" in messages
 
 
-def test_a_plant_that_was_not_read_from_a_file_cannot_be_reloaded(tmp_path: Path) -> None:
+def test_a_plant_without_a_file_cannot_be_reloaded(tmp_path: Path) -> None:
     with served(tmp_path) as gateway:
         gateway.gateway.reload._read = None
         writer = {"authorization": gateway.bearer(Right.WRITE)}
@@ -140,7 +140,7 @@ def test_sigterm_ends_the_gateway_while_viewers_wait_for_values(tmp_path: Path) 
 
 
 @pytest.mark.long
-def test_a_stop_does_not_wait_until_the_log_is_read(tmp_path: Path) -> None:
+def test_a_stop_is_sent_while_nobody_reads_the_log_output(tmp_path: Path) -> None:
     """The log is not read while a user has pressed Ctrl-S in the terminal, or while the journal hangs."""
     with simulated_plant(tmp_path, '[serve]\nlisten = "127.0.0.1:0"\n[serve.may]\nstop = "anyone"\n') as path:
         unread, log = os.pipe()
@@ -220,7 +220,7 @@ def test_the_command_serve_check_reports_mistakes_in_the_plant_file(run: Run, tm
 
 
 @pytest.mark.parametrize("command", ["check", "plan"])
-def test_other_commands_ignore_the_serve_table(run: Run, tmp_path: Path, command: str) -> None:
+def test_commands_other_than_serve_ignore_the_serve_table(run: Run, tmp_path: Path, command: str) -> None:
     plant = written(tmp_path, '[serve]\nlisten = "localhost:80"\nnot_known = 1\n')
     status, out, errors = run(command, plant.path)
     assert (status, errors) == (0, "")
@@ -258,7 +258,7 @@ def test_invalid_options_of_serve_are_refused(run: Run, words: tuple[str, ...], 
     assert run("serve", *words) == (2, "", f"multidrop: {sentence}\n")
 
 
-def test_a_demo_of_the_page_warns_about_ignored_options(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_web_demo_refuses_options_for_recordings(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(serve_command, "serve_demo", lambda **_: 0)
     code, printed, warned = run("demo", "--web")
     assert (code, printed.split()[0], warned) == (0, "Next:", "")
@@ -307,7 +307,7 @@ SERVE = '[serve]\nlisten = "127.0.0.1:0"\n[serve.may]\nstop = "anyone"\n'
 
 
 @pytest.mark.slow
-def test_a_line_whose_port_is_missing_is_polled_as_soon_as_the_port_appears(tmp_path: Path) -> None:
+def test_a_line_is_polled_as_soon_as_its_missing_port_appears(tmp_path: Path) -> None:
     port = tmp_path / "late"
     sims = [simulated(InvtCHE(1, name=name, baudrate=38400)) for name in ("pump-1", "fan-1")]
     with Simulator([Wire([sim], unpaced=True) for sim in sims]) as simulator:

@@ -164,14 +164,14 @@ def test_each_mistake_in_the_serve_table_names_the_line_of_its_key(tmp_path: Pat
         ),
     ],
 )
-def test_patterns_and_families_of_drives_allow_exactly_the_drives_they_name(
+def test_rights_with_patterns_or_families_apply_only_to_matching_drives(
     tmp_path: Path, may: str, write: set[str], verbs: set[str]
 ) -> None:
     found = read_settings(written(tmp_path, f"[serve.may]\n{may}\n", *NAMES), {}).may
     assert (found.write, found.verbs) == (write, verbs)
 
 
-def test_a_pattern_allows_a_register_only_for_drives_that_have_it(tmp_path: Path) -> None:
+def test_a_pattern_allows_writes_only_to_drives_with_that_register(tmp_path: Path) -> None:
     mixed = plant_text("/dev/ttyUSB0", NAMES, '[serve.may]\nwrite = ["*.setpoint"]\n').replace(
         'name = "fan-1"\nmodel = "invt-che"', 'name = "fan-1"\nmodel = "yd1000"'
     )
@@ -290,7 +290,7 @@ def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (("own.pem", "own.pem"), "must be a certificate and a key in PEM, without password"),
     ],
 )
-def test_certificates_that_are_invalid_or_do_not_fit_their_key_are_reported(
+def test_invalid_certificates_and_wrong_private_keys_are_reported(
     tmp_path: Path, certificates: Path, pair: tuple[str, str], why: str
 ) -> None:
     paths = [certificates / name for name in pair]
@@ -357,7 +357,7 @@ def test_each_setting_with_a_used_tcp_port_is_reported_once(tmp_path: Path) -> N
     assert mistakes(tmp_path, serve) == [f"[serve.modbus]: {in_use}", f"[serve.opcua]: {in_use}"]
 
 
-def test_two_settings_may_have_one_tcp_port_on_different_addresses(tmp_path: Path) -> None:
+def test_two_settings_may_use_the_same_tcp_port_on_different_addresses(tmp_path: Path) -> None:
     serve = '[serve]\nlisten = "{}"\n[serve.modbus]\nlisten = "{}"\nclients = ["::1"]\n'
     for page, modbus in (("127.0.0.1", "127.0.0.2"), ("[::1]", "127.0.0.1"), ("[::1]", "0.0.0.0")):
         read_settings(written(tmp_path, serve.format(f"{page}:1502", f"{modbus}:1502")), {})
@@ -399,7 +399,7 @@ def test_a_certificate_without_its_private_key_is_reported(tmp_path: Path, certi
     assert only == "[serve]: certificate alone is not enough: give both keys, certificate and key"
 
 
-def test_a_folder_in_which_no_audit_log_can_be_written_is_reported(tmp_path: Path) -> None:
+def test_an_audit_log_that_cannot_be_written_is_reported(tmp_path: Path) -> None:
     """The test uses /sys, where not even root may create a file."""
     with pytest.raises(PlantError) as wrong:
         read_settings(written(tmp_path), {"STATE_DIRECTORY": "/sys"})
@@ -407,7 +407,7 @@ def test_a_folder_in_which_no_audit_log_can_be_written_is_reported(tmp_path: Pat
     assert only.endswith(": [serve]: audit /sys/audit.jsonl cannot be written: Permission denied")
 
 
-def test_credentials_and_the_state_folder_of_the_service_manager_are_used(tmp_path: Path) -> None:
+def test_credentials_and_state_folder_of_systemd_replace_the_default_files(tmp_path: Path) -> None:
     """Its credentials are used rather than files beside the plant file; output is in its state folder."""
     credentials, state = tmp_path / "credentials", tmp_path / "state"
     credentials.mkdir()
@@ -420,7 +420,7 @@ def test_credentials_and_the_state_folder_of_the_service_manager_are_used(tmp_pa
     assert settings.audit == state / "audit.jsonl"
 
 
-def test_a_setting_that_requires_tokens_needs_a_token_file(tmp_path: Path) -> None:
+def test_a_missing_token_file_is_reported_if_a_setting_requires_tokens(tmp_path: Path) -> None:
     (only,) = mistakes(tmp_path, '[serve.may]\nlook = "token"\n')
     assert only == ('[serve]: look = "token" of [serve.may] needs a file of tokens; add tokens = "tokens"')
 

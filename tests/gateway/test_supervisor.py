@@ -94,7 +94,7 @@ def test_a_gateway_has_exactly_the_expected_tasks_and_threads(gateway: Served) -
 
 
 @pytest.mark.parametrize("name", usually("polling", *sorted(TASKS - {"web", "polling"})))
-def test_a_stop_continues_whichever_task_is_killed(
+def test_stops_are_sent_after_a_gateway_task_was_cancelled(
     gateway: Served, name: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     assert dead(gateway) == {}
@@ -104,7 +104,7 @@ def test_a_stop_continues_whichever_task_is_killed(
     assert all(one["done"] for one in gateway.post("/api/stop").json.values())
 
 
-def test_without_a_poller_stops_are_still_sent(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stops_are_sent_after_polling_has_failed(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail() -> None:
         raise ZeroDivisionError("a bug in a user's class")
 
@@ -116,7 +116,9 @@ def test_without_a_poller_stops_are_still_sent(gateway: Served, monkeypatch: pyt
 
 
 @pytest.mark.long
-def test_a_line_whose_polling_fails_is_reported(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_health_reports_the_lines_that_cannot_be_polled(
+    gateway: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
     failures = {"hall": "ZeroDivisionError: a bug in a user's class"}
     monkeypatch.setattr(Poller, "line_failures", property(lambda poller: failures), raising=False)
     found = gateway.get("/health").json
@@ -126,7 +128,7 @@ def test_a_line_whose_polling_fails_is_reported(gateway: Served, monkeypatch: py
 
 @pytest.mark.long
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_a_dead_history_thread_makes_health_fail(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_health_fails_if_the_history_thread_ends(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     part: Any = gateway.gateway.feeds["history"]
 
     def leave() -> None:
@@ -141,14 +143,14 @@ def test_a_dead_history_thread_makes_health_fail(gateway: Served, monkeypatch: p
 
 
 @pytest.mark.long
-def test_a_thread_of_the_broker_connection_that_ends_makes_health_fail(gateway: Served) -> None:
+def test_health_fails_if_the_thread_of_the_broker_connection_ends(gateway: Served) -> None:
     part: Any = gateway.gateway.feeds["mqtt"]
     part._brokers[0]._client.disconnect()  # unexpected, because the gateway did not request it
     until(lambda: dead(gateway) == {"mqtt": "RuntimeError: the thread of the broker's connection has ended"})
 
 
 @pytest.mark.long
-def test_a_watched_thread_that_ends_makes_health_fail(gateway: Served) -> None:
+def test_health_fails_if_a_watched_thread_ends(gateway: Served) -> None:
     over = threading.Event()
     in_loop(gateway.loop, lambda found: found.watch("log", lambda: not over.is_set()))
     assert dead(gateway) == {}
@@ -214,7 +216,7 @@ def names_of_tasks(loop: asyncio.AbstractEventLoop) -> set[str]:
 
 
 @pytest.mark.slow
-def test_each_thread_and_task_of_all_parts_is_listed_and_reported_if_it_ends(
+def test_health_reports_each_gateway_thread_or_task_that_ends(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for library in ("paho.mqtt.client", "nats", "asyncua", "psycopg", "pyarrow"):
@@ -269,7 +271,7 @@ def test_each_thread_and_task_of_all_parts_is_listed_and_reported_if_it_ends(
         assert all(one["done"] for one in gateway.post("/api/stop").json.values())
 
 
-async def test_a_released_task_that_ends_is_not_reported_as_dead() -> None:
+async def test_a_task_released_by_the_supervisor_is_not_reported_as_dead() -> None:
     supervisor().keep("released", asyncio.sleep(60))
     supervisor().keep("let go of", asyncio.sleep(0))
     await supervisor().release("released", "never there")
@@ -279,7 +281,7 @@ async def test_a_released_task_that_ends_is_not_reported_as_dead() -> None:
     assert supervisor().dead == {}
 
 
-async def test_a_dead_task_that_is_started_again_is_no_longer_reported() -> None:
+async def test_a_dead_task_is_no_longer_reported_after_a_new_start() -> None:
     await asyncio.wait([supervisor().keep("part", asyncio.sleep(0))])
     await asyncio.sleep(0)
     assert supervisor().dead == {"part": "it returned"}
@@ -297,7 +299,7 @@ async def test_a_failure_of_a_supervised_function_is_raised_in_its_caller(failur
         await supervisor().within("work", 60, work)
 
 
-async def test_supervised_work_that_hangs_is_reported_until_later_work_succeeds() -> None:
+async def test_hanging_work_is_reported_until_later_work_succeeds() -> None:
     go_on = threading.Event()
     threads = supervisor()
     with pytest.raises(Hung, match=r"history: not done within 0.01 s; does the disk answer\?"):
@@ -324,7 +326,7 @@ async def test_the_supervisor_raises_an_error_if_no_thread_can_start(monkeypatch
     assert supervisor().under_way == []
 
 
-def test_supervised_work_returns_its_result_or_raises_hung() -> None:
+def test_supervised_work_raises_hung_only_after_its_time_limit() -> None:
     go_on = threading.Event()
 
     def fail() -> None:

@@ -76,7 +76,7 @@ def test_each_message_is_sent_once_although_the_receiver_fails_at_random() -> No
 
 
 @pytest.mark.slow
-def test_after_two_hours_without_a_receiver_no_row_is_lost_or_doubled(clocked: Clocked) -> None:
+def test_each_row_is_sent_once_after_two_hours_without_a_receiver(clocked: Clocked) -> None:
     messages, period_s = 240, 30.0  # two hours
     clocked.receiver.failure = ConnectionRefusedError("Connection refused")
     due_s = 0.0
@@ -109,7 +109,7 @@ def test_sent_messages_are_deleted_from_the_disk(clocked: Clocked) -> None:
     until(lambda: clocked.spool.state().oldest == 6)
 
 
-def test_a_full_spool_deletes_its_oldest_rows_and_counts_them_as_lost(tmp_path: Path) -> None:
+def test_the_oldest_unsent_rows_are_deleted_at_the_size_limit(tmp_path: Path) -> None:
     first = Clocked(tmp_path / "one")
     store(first.spool, 0, 5)
     first.spool.close()
@@ -129,7 +129,7 @@ def test_a_full_spool_deletes_its_oldest_rows_and_counts_them_as_lost(tmp_path: 
     full.spool.close()
 
 
-def test_sent_messages_that_a_full_spool_deletes_do_not_count_as_lost(tmp_path: Path) -> None:
+def test_sent_rows_do_not_count_as_lost_when_deleted(tmp_path: Path) -> None:
     """The full spool deletes messages 1 to 3. Message 3 had been sent, so only the rows of two are lost."""
     clocked = Clocked(tmp_path / "spool", most=1)
     clocked.spool.acknowledge(3, [(1, 2)])
@@ -155,7 +155,9 @@ def test_a_restarted_forwarder_continues_after_the_last_sent_message(tmp_path: P
     assert [one.is_historical for one in second.receiver.messages[3:]] == [False, True]
 
 
-def test_an_unacknowledged_message_keeps_its_id(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_message_keeps_its_id_when_sent_again_after_a_restart(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     first = Clocked(tmp_path / "spool")
     store(first.spool, 0, 5)
     with monkeypatch.context() as patch:
@@ -184,7 +186,7 @@ def test_all_messages_are_sent_again_if_the_position_file_is_damaged(tmp_path: P
     assert second.receiver.sequences == [2, 1]
 
 
-def test_a_position_file_beyond_the_newest_spooled_message_is_reported(tmp_path: Path) -> None:
+def test_a_too_large_number_in_the_position_file_is_reported(tmp_path: Path) -> None:
     clocked = Clocked(tmp_path / "spool")
     (tmp_path / "spool" / "position.json").write_text('{"newest": 7, "gaps": []}')
     store(clocked.spool, 0, 5)
@@ -194,7 +196,7 @@ def test_a_position_file_beyond_the_newest_spooled_message_is_reported(tmp_path:
     assert clocked.receiver.messages == []
 
 
-def test_a_refused_message_is_skipped_if_the_receiver_accepts_other_messages(clocked: Clocked) -> None:
+def test_a_refused_message_is_skipped_if_the_next_one_is_accepted(clocked: Clocked) -> None:
     clocked.receiver.failure = Refused("HTTP Error 400: field type conflict")
     store(clocked.spool, 0, 5)
     assert clocked.send_all() > 0
@@ -218,7 +220,9 @@ def test_no_message_is_lost_while_the_receiver_refuses_all_messages(clocked: Clo
     assert clocked.forwarder.refused == 0
 
 
-def test_the_number_of_stored_refusals_is_limited(clocked: Clocked, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_the_newest_refusals_are_kept_in_memory(
+    clocked: Clocked, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(forwarder_module, "MOST_REFUSALS", 2)
     test_no_message_is_lost_while_the_receiver_refuses_all_messages(clocked)
     assert [*clocked.forwarder._refusals] == [4, 5]
@@ -239,7 +243,7 @@ def test_a_hanging_receiver_is_reported(clocked: Clocked) -> None:
 
 
 @table("failure", [OSError("away"), KeyError("bug"), MemoryError()])
-def test_rows_stay_in_the_spool_after_any_failure_of_the_receiver(tmp_path: Path, failure: Exception) -> None:
+def test_unsent_rows_are_kept_after_any_failure_of_the_receiver(tmp_path: Path, failure: Exception) -> None:
     clocked = Clocked(tmp_path / "spool")
     clocked.receiver.failure = failure
     store(clocked.spool, 0, 5)

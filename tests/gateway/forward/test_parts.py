@@ -124,7 +124,7 @@ def test_a_spool_folder_with_other_files_is_reported_in_one_sentence(tmp_path: P
 
 
 @pytest.mark.slow
-def test_a_gateway_uploads_all_rows_with_units_and_shows_no_secret(tmp_path: Path) -> None:
+def test_a_gateway_uploads_rows_with_their_units_to_a_web_server(tmp_path: Path) -> None:
     with web_server() as posted:
         (tmp_path / "token").write_text("T0K3N\n")
         serve = f'[serve.upload]\nurl = "{posted.url}"\ntoken = "token"\n'
@@ -165,7 +165,9 @@ def test_a_hanging_receiver_delays_neither_polling_nor_stops_nor_the_shutdown(tm
 
 
 @pytest.mark.slow
-def test_rows_do_not_wait_for_a_hanging_deletion(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_new_rows_are_accepted_while_the_deletion_of_old_files_hangs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     part = forwarding("upload", "http://localhost:9/", tmp_path)
     store(part._spool, 0, 5)
     part._spool.acknowledge(1)
@@ -260,7 +262,8 @@ def batch_at(time_ns: int) -> Any:
     return Batch(columns, Names(["pump-1"]), Names(["load"]))
 
 
-def test_rows_of_unknown_unit_are_not_sent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_late_rows_from_before_a_reload_are_not_sent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The reload changes the unit of the register, so the unit of a late row is unknown."""
     sent: list[Any] = []
     monkeypatch.setattr(forwarder, "monotonic_ns", lambda: 1000)
     made: Any = Forwarding(  # type: ignore[arg-type]

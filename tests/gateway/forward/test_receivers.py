@@ -100,7 +100,7 @@ def wanted(exchanges: range) -> Counter[Key]:
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("kills", first_in_ci(3, 20))
-def test_a_killed_gateway_loses_and_doubles_no_row(tmp_path: Path, kind: str, kills: int) -> None:
+def test_each_row_arrives_once_although_the_gateway_is_killed(tmp_path: Path, kind: str, kills: int) -> None:
     """Each run of the gateway has its own exchange numbers. Each row on the disk must arrive exactly once."""
     dice = random.Random(kills)
     support = os.pathsep.join(map(str, Path(forwarded.__file__).parents[1].iterdir()))
@@ -134,7 +134,7 @@ def test_a_killed_gateway_loses_and_doubles_no_row(tmp_path: Path, kind: str, ki
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("kills", first_in_ci(3, 20))
-def test_kills_of_the_database_lose_and_double_no_row(tmp_path: Path, kills: int) -> None:
+def test_each_row_arrives_once_although_the_database_is_killed(tmp_path: Path, kills: int) -> None:
     """The database is killed while rows arrive, and is then started again."""
     dice = random.Random(kills)
     with postgres() as database:
@@ -198,7 +198,7 @@ def test_a_postgres_database_stores_rows_and_the_newest_message_number(tmp_path:
 
 
 @pytest.mark.slow
-def test_a_database_that_was_down_for_two_hours_gets_each_row_once(tmp_path: Path) -> None:
+def test_a_database_gets_each_row_once_after_two_hours_of_downtime(tmp_path: Path) -> None:
     with postgres() as database:
         part = forwarding("postgres", database.where, tmp_path)
         sender, now_s = part._forwarder, [0.0]
@@ -225,7 +225,7 @@ def test_a_database_that_was_down_for_two_hours_gets_each_row_once(tmp_path: Pat
 
 
 @pytest.mark.slow
-def test_a_broker_that_is_away_for_two_hours_gets_each_row_once(tmp_path: Path) -> None:
+def test_a_broker_gets_each_row_once_after_two_hours_of_downtime(tmp_path: Path) -> None:
     require_module("paho.mqtt.client")
     with ExitStack() as stack:
         broker = stack.enter_context(mosquitto(tmp_path))
@@ -255,7 +255,7 @@ def test_a_broker_that_is_away_for_two_hours_gets_each_row_once(tmp_path: Path) 
 
 
 @pytest.mark.slow
-def test_influx_keeps_special_characters_of_names_and_stores_a_repeated_row_once(tmp_path: Path) -> None:
+def test_influx_stores_repeated_rows_with_special_characters_once(tmp_path: Path) -> None:
     given = [
         ("a b,c=d", "n", 1e-7, "ok", "kgf/cm²"),
         ("насос", "n", 1.0, "ok", "names of yd1000"),

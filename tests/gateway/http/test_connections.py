@@ -109,7 +109,7 @@ def connected(gateway: Served) -> Iterator[socket.socket]:
 
 @pytest.mark.long
 @pytest.mark.parametrize(("sent", "begin"), [(SLOW[1], b""), (SLOW[2], b"HTTP/1.1 408 ")])
-def test_an_unfinished_request_ends_its_connection(
+def test_a_connection_is_closed_if_a_request_stays_unfinished(
     gateway: Served, monkeypatch: pytest.MonkeyPatch, sent: bytes, begin: bytes
 ) -> None:
     monkeypatch.setattr(connections, "FIRST_S", 0.1)
@@ -127,7 +127,7 @@ def test_a_request_with_long_headers_is_refused_unless_it_is_a_stop(gateway: Ser
     assert gateway.post("/api/stop", {}, cookie=cookie).status == 200
 
 
-def test_headers_that_arrive_in_pieces_are_accepted_up_to_the_size_limit(gateway: Served) -> None:
+def test_http_headers_may_arrive_in_pieces_up_to_the_size_limit(gateway: Served) -> None:
     head = b"GET /api/plant HTTP/1.1\r\nhost: localhost\r\ncookie: "
     with connected(gateway) as client:
         client.sendall(head + b"b" * (MOST_HEAD // 2))
@@ -163,7 +163,7 @@ def is_ended(pair: tuple[socket.socket, socket.socket]) -> bool:
         return False
 
 
-def test_a_connection_is_closed_if_it_stays_without_a_request_too_long(
+def test_an_idle_connection_is_closed_after_a_time_limit(
     clock: Clock, pairs: list[tuple[socket.socket, socket.socket]]
 ) -> None:
     connections = Connections(clock)
@@ -187,7 +187,7 @@ def test_a_connection_is_closed_if_it_stays_without_a_request_too_long(
     assert len(connections) == 1
 
 
-def test_the_connection_that_is_idle_longest_is_closed_to_accept_a_new_one(
+def test_the_longest_idle_connection_is_closed_if_too_many_are_open(
     clock: Clock, pairs: list[tuple[socket.socket, socket.socket]]
 ) -> None:
     connections = Connections(clock)
@@ -221,7 +221,7 @@ def test_a_new_connection_is_not_closed_before_its_first_request(
 
 
 @pytest.mark.parametrize("is_stalled", [False, True], ids=["sends ahead", "reads nothing"])
-def test_connections_of_greedy_clients_are_closed_first_and_those_with_stops_last(
+def test_connections_of_greedy_clients_are_closed_before_others(
     clock: Clock, pairs: list[tuple[socket.socket, socket.socket]], is_stalled: bool
 ) -> None:
     connections = Connections(clock)
@@ -241,7 +241,7 @@ def test_connections_of_greedy_clients_are_closed_first_and_those_with_stops_las
     assert len(connections) == MOST_OPEN
 
 
-def test_a_connection_whose_client_reads_no_answers_is_closed(
+def test_a_connection_is_closed_if_its_client_reads_no_answers(
     clock: Clock, pairs: list[tuple[socket.socket, socket.socket]]
 ) -> None:
     connections = Connections(clock)
@@ -256,7 +256,7 @@ def test_a_connection_whose_client_reads_no_answers_is_closed(
 
 
 @pytest.mark.long
-async def test_further_http_stops_of_a_silent_drive_are_sent_as_one(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_http_stops_beyond_a_limit_are_combined_into_one_stop(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(web, "HEAD_S", 0.01)
     called, silent = list[list[str]](), asyncio.Event()
 
@@ -278,7 +278,7 @@ async def test_further_http_stops_of_a_silent_drive_are_sent_as_one(monkeypatch:
     silent.set()
 
 
-async def test_a_stop_starts_before_the_waiting_reads() -> None:
+async def test_a_stop_is_processed_before_waiting_reads() -> None:
     order: list[str] = []
 
     async def take(turns: Turns, name: str, waiting: deque[asyncio.Future[None]]) -> None:
@@ -354,7 +354,9 @@ def test_an_unfinished_request_is_answered_with_503_at_shutdown(
     assert "Traceback" not in caplog.text
 
 
-def test_a_pipelining_client_counts_as_greedy(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_client_counts_as_greedy_while_two_requests_are_pending(
+    gateway: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
     go_on = asyncio.Event()
 
     async def after(n: int) -> None:

@@ -50,7 +50,7 @@ def gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
         yield gateway
 
 
-def test_openapi_describes_each_route_with_its_refusals(gateway: Served) -> None:
+def test_openapi_describes_each_route_and_error_status(gateway: Served) -> None:
     told = gateway.get("/openapi.json").json
     assert told == json.loads(json.dumps(openapi(gateway.gateway.version)))
     assert set(told["paths"]) == {one.path for one in OPERATIONS}
@@ -185,7 +185,7 @@ def test_csv_exports_are_compressed(gateway: Served) -> None:
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_schemathesis_finds_no_undeclared_answer(gateway: Served, tmp_path: Path) -> None:
+def test_answers_to_random_requests_agree_with_openapi(gateway: Served, tmp_path: Path) -> None:
     """Let schemathesis send valid and invalid requests, and check each answer by openapi.json.
 
     One check is excluded: that each request which is valid by its schema is accepted. A schema cannot express
@@ -252,7 +252,7 @@ class SlowHistory:
     async def close(self) -> None: ...
 
 
-def test_concurrent_exports_are_limited_and_do_not_delay_a_stop(tmp_path: Path) -> None:
+def test_a_stop_does_not_wait_for_concurrent_exports(tmp_path: Path) -> None:
     with (
         served(tmp_path, '[serve.may]\nstop = "anyone"\n') as gateway,
         ThreadPoolExecutor(MOST_EXPORTS) as clients,
@@ -308,7 +308,7 @@ def test_the_file_name_of_an_export_has_the_drive_and_the_time_range(asked: str,
     assert plain.count('"') == 2
 
 
-async def test_an_export_whose_name_is_invalid_does_not_count_as_under_way() -> None:
+async def test_a_refused_export_does_not_count_as_in_progress() -> None:
     exports, part = Exports(), SimpleNamespace(export=lambda *asked: iter([b""]))
     with pytest.raises(Denied):
         await exports.respond(part, ["\ud800.y"], 0, 1, "csv")

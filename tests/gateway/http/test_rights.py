@@ -91,7 +91,9 @@ TABLE = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("serve", "address"), TABLE)
-def test_rights_follow_from_token_and_settings(tmp_path: Path, serve: str, address: str) -> None:
+def test_rights_depend_on_the_token_the_address_and_the_settings(
+    tmp_path: Path, serve: str, address: str
+) -> None:
     with served(tmp_path, serve, behind_proxy=address is OTHER) as gateway:
         until(lambda: gateway.gateway.hub.taken > 0)
         for right, look, acts in TABLE[serve, address]:
@@ -202,7 +204,9 @@ ORIGINS = {
 
 
 @table("case", ORIGINS)
-def test_only_the_gateways_own_page_may_be_the_origin(case: tuple[str, str, tuple[str, ...]]) -> None:
+def test_only_addresses_of_the_gateways_own_page_are_allowed_origins(
+    case: tuple[str, str, tuple[str, ...]],
+) -> None:
     origin, host, schemes = case
     names = OwnNames(["plant.example"], "0.0.0.0", 443)
     assert names.has_origin(origin, host, schemes) is ORIGINS[case]
@@ -268,7 +272,7 @@ def test_wrong_http_methods_and_invalid_bodies_are_refused(open_gateway: Served)
     assert post("/api/act", {"drive": "pump-1", "verb": "start", "options": []}, **writer).status == 400
 
 
-def test_a_name_with_a_lone_surrogate_is_answered_like_any_unknown_name(open_gateway: Served) -> None:
+def test_invalid_unicode_names_are_answered_like_unknown_names(open_gateway: Served) -> None:
     post, writer = open_gateway.post, {"authorization": open_gateway.bearer(Right.WRITE)}
     odd = "\ud800"
     assert post("/api/token", {"token": odd}).status == 401
@@ -281,7 +285,7 @@ def test_a_name_with_a_lone_surrogate_is_answered_like_any_unknown_name(open_gat
     assert repr(odd) in unknown.json["error"]
 
 
-def test_the_web_page_keeps_its_token_in_a_cookie_hidden_from_scripts(open_gateway: Served) -> None:
+def test_the_token_of_the_web_page_is_in_a_cookie_hidden_from_scripts(open_gateway: Served) -> None:
     told = open_gateway.post("/api/token", {"token": open_gateway.secrets[Right.WRITE]})
     assert told.json == {"name": "writer", "role": "write"}
     cookie = told.headers["set-cookie"]
@@ -295,7 +299,7 @@ def test_the_web_page_keeps_its_token_in_a_cookie_hidden_from_scripts(open_gatew
     assert "Max-Age=0" in gone
 
 
-def test_after_five_wrong_tokens_an_address_is_refused_but_may_stop(tmp_path: Path) -> None:
+def test_a_client_address_can_only_stop_drives_after_five_wrong_tokens(tmp_path: Path) -> None:
     """A valid token still works from other addresses. From the refused address, it works only for a stop."""
     now = [1000.0]
     with served(tmp_path, CLOSED, behind_proxy=True) as gateway:
@@ -361,7 +365,7 @@ def test_a_new_token_is_accepted_after_many_requests_with_a_revoked_token(tmp_pa
 
 
 @pytest.mark.slow
-def test_the_audit_log_names_the_caller_and_its_interface(tmp_path: Path) -> None:
+def test_the_audit_log_names_the_sender_and_the_interface_of_a_command(tmp_path: Path) -> None:
     with served(tmp_path, LOOPBACK_STOPS) as gateway:
         until(lambda: gateway.gateway.hub.taken > 0)
         writer = {"authorization": gateway.bearer(Right.WRITE)}
@@ -437,7 +441,7 @@ def test_callers_with_the_role_stop_can_only_stop(way: str) -> None:
 
 
 @table("way", WAYS)
-def test_writes_not_listed_in_the_settings_are_refused_despite_the_right_to_write(way: str) -> None:
+def test_writes_are_refused_if_the_settings_do_not_list_them(way: str) -> None:
     rules = rules_of(May(), way, Right.WRITE)
     listed = {verb: rules[verb] for verb in VERBS if verb != "stop"}
     assert {*listed.values()} == {NEVER_THIS_WAY if way == "modbus" else NOT_LISTED}
@@ -451,7 +455,9 @@ def test_verbs_are_refused_over_modbus_even_if_the_settings_list_them() -> None:
     assert {rules[verb] for verb in VERBS} == {NEVER_THIS_WAY}
 
 
-async def test_the_limit_of_concurrent_writes_lets_stops_pass(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_stop_is_sent_when_the_limit_of_concurrent_writes_is_reached(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Each write occupies a thread, so a blocked line could otherwise occupy any number of threads."""
     go_on = threading.Event()
 

@@ -60,7 +60,7 @@ def take(hub: Hub, at_s: float, **values: int) -> None:
     hub.take(Batch(columns, Names(("pump-1",)), Names(REGISTERS)))
 
 
-def test_a_drive_shows_a_fault_when_its_fault_record_changes(tmp_path: Path) -> None:
+def test_a_change_of_the_fault_record_is_shown_as_a_fault(tmp_path: Path) -> None:
     hub = hub_of(tmp_path, "erman-er-g-220", ERMAN)
     take(hub, 10, status=RUNNING, output_frequency=500, last_fault=0)
     assert hub.seen("pump-1").state == "runs"
@@ -76,7 +76,7 @@ def test_a_drive_shows_a_fault_when_its_fault_record_changes(tmp_path: Path) -> 
     assert hub.seen("pump-1").state == "stands"
 
 
-def test_a_reset_ends_a_recorded_fault_and_an_old_record_is_no_fault(tmp_path: Path) -> None:
+def test_a_recorded_fault_is_no_longer_shown_after_a_reset(tmp_path: Path) -> None:
     hub = hub_of(tmp_path, "erman-er-g-220", ERMAN)
     take(hub, 10, status=STOPPED, output_frequency=0, last_fault=ErmanFault.OVERHEAT)
     past = "last fault overheat, which may still be in force"
@@ -100,7 +100,7 @@ def test_a_new_fault_record_of_a_yd1000_is_shown_as_a_fault(tmp_path: Path) -> N
     assert hub.seen("pump-1").fault == "fault record 1: 18"
 
 
-def test_an_unknown_state_has_a_reason(tmp_path: Path) -> None:
+def test_a_reason_is_shown_if_the_state_of_a_drive_is_unknown(tmp_path: Path) -> None:
     hub = hub_of(tmp_path, "erman-er-g-220", '["status", "output_frequency"]')
     take(hub, 10, output_frequency=0, status=STOPPED)
     assert hub.seen("pump-1") == Shown("unknown", None, "last_fault is not polled")
@@ -121,7 +121,9 @@ def test_an_unknown_state_has_a_reason(tmp_path: Path) -> None:
         ("delixi-native", ("status",), True),
     ],
 )
-def test_polled_registers_decide_if_faults_show(model: str, polled: tuple[str, ...], is_seen: bool) -> None:
+def test_faults_can_be_shown_only_if_suitable_registers_are_polled(
+    model: str, polled: tuple[str, ...], is_seen: bool
+) -> None:
     assert can_show_fault(MODELS[model](1), polled) is is_seen
 
 
@@ -138,7 +140,7 @@ def test_the_command_serve_check_warns_if_no_polled_register_can_show_a_fault(
     assert f"pump-1: {advice}" in errors
 
 
-def test_a_device_without_a_motor_or_a_fault_register_causes_no_warning() -> None:
+def test_the_missing_fault_register_of_a_meter_causes_no_warning() -> None:
     class Meter(Drive):
         has_motor = False
         voltage = reading(0, "V", step=1)
@@ -155,7 +157,7 @@ def seen(events: Alarms) -> list[tuple[str, str, int, int | None]]:
 
 
 @pytest.mark.parametrize("standing", [STANDS, Shown("unknown", None)])
-def test_a_motor_that_stops_without_a_command_raises_an_alarm(standing: Shown) -> None:
+def test_an_alarm_is_raised_if_a_motor_stops_without_a_command(standing: Shown) -> None:
     events = Alarms()
     for time, shown in ((1000, standing), (2000, RUNS), (3000, standing), (4999, standing)):
         events.look(time, "pump-1", shown, 0)
@@ -174,7 +176,7 @@ def test_a_motor_that_stops_without_a_command_raises_an_alarm(standing: Shown) -
     assert seen(events) == told
 
 
-def test_a_motor_stopped_by_a_fault_raises_only_the_alarm_of_the_fault() -> None:
+def test_no_stop_alarm_is_raised_if_a_fault_stopped_the_motor() -> None:
     events = Alarms()
     for time, shown in enumerate((RUNS, Shown("silent", "no reply"), Shown("fault", "a"), STANDS), 1):
         events.look(time, "pump-1", shown, 0)
@@ -206,7 +208,7 @@ def test_alarms_are_sorted_by_kind_with_acknowledged_alarms_last() -> None:
     assert ("hall", "port", 4, 11) in seen(events)
 
 
-def test_an_alarm_found_right_after_the_start_is_marked_as_possibly_older() -> None:
+def test_alarms_at_the_gateway_start_are_marked_as_possibly_older() -> None:
     events = Alarms()
     events.look(1, "pump-1", Shown("fault", "overheat"))
     events.look(1, "pump-2", RUNS)
@@ -219,7 +221,7 @@ def test_an_alarm_found_right_after_the_start_is_marked_as_possibly_older() -> N
     }  # fmt: skip
 
 
-def test_alarms_from_before_a_restart_continue_or_end() -> None:
+def test_alarms_continue_after_a_restart_if_the_fault_is_still_shown() -> None:
     kept: dict[str, Alarm] = {}
     before = Alarms(0, lambda alarm, change: kept.update({alarm.id: alarm}))
     for drive in ("goes-on", "is-over", "is-another", "is-gone", "is-silent"):
@@ -273,7 +275,7 @@ def past_of(path: Path) -> list[Alarm]:
     return kept.past or []
 
 
-def test_the_last_line_about_an_alarm_in_the_alarm_file_is_used(tmp_path: Path) -> None:
+def test_the_last_line_in_the_alarm_file_gives_the_state_of_an_alarm(tmp_path: Path) -> None:
     path = tmp_path / "alarms.jsonl"
     kept = started(path)
     for alarm in (ALARM, ALARM._replace(ended=5), ALARM._replace(time=9)):
@@ -309,7 +311,7 @@ def test_a_long_alarm_file_is_rewritten(tmp_path: Path, monkeypatch: pytest.Monk
     assert past_of(path) == [ALARM]
 
 
-def test_a_failing_disk_is_reported_and_the_alarm_file_is_rewritten_later(tmp_path: Path) -> None:
+def test_the_alarm_file_is_rewritten_after_a_failing_disk_recovers(tmp_path: Path) -> None:
     folder = tmp_path / "none"
     kept = started(folder / "alarms.jsonl")
     kept.note(ALARM)
@@ -384,7 +386,7 @@ def test_a_lost_port_raises_one_alarm_for_its_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_only_a_stop_from_elsewhere_raises_an_alarm(tmp_path: Path) -> None:
+def test_a_motor_stopped_by_the_gateway_raises_no_alarm(tmp_path: Path) -> None:
     serve = '[serve.may]\nstop = "anyone"\nwrite = ["pump-1.setpoint"]\nverbs = ["pump-1.start"]\n'
     with served(tmp_path, serve) as gateway:
         gateway.start("pump-1")
@@ -414,7 +416,7 @@ def test_only_a_stop_from_elsewhere_raises_an_alarm(tmp_path: Path) -> None:
         (BusError("pump-1.coast: no stop of start"), "pump-1.coast: no stop of start"),
     ],
 )
-def test_errors_on_the_web_page_contain_no_function_names(failure: BusError, said: str) -> None:
+def test_error_texts_on_the_web_page_contain_no_function_names(failure: BusError, said: str) -> None:
     assert in_words(str(failure), failure) == said
 
 
@@ -436,7 +438,9 @@ BELOW = Limit("pump", "pressure", "bar", False, 1.0, hysteresis=0.5)
         ([30] * 7, [False] * 7),  # equal to the limit is not above it
     ],
 )
-def test_a_limit_has_duration_and_hysteresis(values: list[float | None], beyond: list[bool]) -> None:
+def test_an_alarm_limit_has_a_duration_and_a_hysteresis(
+    values: list[float | None], beyond: list[bool]
+) -> None:
     limits, text, seen = Limits([ABOVE]), "", []
     for second, value in enumerate(values):
         text = limits.exceeded(second, "pump", {} if value is None else {"current": value}, text)
@@ -444,7 +448,7 @@ def test_a_limit_has_duration_and_hysteresis(values: list[float | None], beyond:
     assert seen == beyond
 
 
-def test_a_second_exceeded_limit_raises_a_new_alarm_but_its_end_does_not() -> None:
+def test_a_new_alarm_is_raised_if_a_second_limit_is_exceeded() -> None:
     limits = Limits([ABOVE._replace(lasting_s=0.0), BELOW])
     noted: list[Alarm] = []
     alarms = Alarms(note=lambda alarm, change: noted.append(alarm))
@@ -460,7 +464,7 @@ def test_a_second_exceeded_limit_raises_a_new_alarm_but_its_end_does_not() -> No
     ]
 
 
-def test_a_limit_that_was_exceeded_before_a_restart_stays_exceeded() -> None:
+def test_an_alarm_limit_stays_exceeded_after_a_restart() -> None:
     assert Limits([ABOVE]).exceeded(0, "pump", {"current": 29}, "current above 30 A")
 
 

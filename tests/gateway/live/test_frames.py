@@ -41,7 +41,9 @@ def frames(clock: Clock, made: list[int]) -> Frames:
     return Frames(make, clock)
 
 
-async def test_a_hundred_viewers_share_one_message(frames: Frames, clock: Clock, made: list[int]) -> None:
+async def test_a_hundred_viewers_get_the_same_message_object(
+    frames: Frames, clock: Clock, made: list[int]
+) -> None:
     first = await frames.after(-1)
     assert first is not None
     viewers = [asyncio.create_task(frames.after(first.n)) for _ in range(100)]
@@ -95,7 +97,7 @@ async def test_at_most_five_messages_are_made_per_second(
     assert 45 <= len(made) <= 51
 
 
-async def test_new_rows_are_sent_as_soon_as_the_next_message_is_due(frames: Frames, clock: Clock) -> None:
+async def test_new_values_are_sent_as_soon_as_the_next_message_is_due(frames: Frames, clock: Clock) -> None:
     """The message is made even if no further rows arrive."""
     first = await frames.after(-1)
     assert first is not None
@@ -116,7 +118,7 @@ def test_no_message_is_made_without_viewers(frames: Frames, clock: Clock, made: 
     assert made == []
 
 
-async def test_a_viewer_that_was_away_gets_the_newest_message(frames: Frames, clock: Clock) -> None:
+async def test_a_viewer_gets_the_newest_message_after_an_absence(frames: Frames, clock: Clock) -> None:
     first = await frames.after(-1)
     assert first is not None
     for _ in range(50):  # newer messages, which the viewer does not request
@@ -156,7 +158,7 @@ plants = st.fixed_dictionaries(
 
 
 @given(plants, plants)
-def test_changes_turn_the_old_message_into_the_new_one(before: dict[str, Any], now: dict[str, Any]) -> None:
+def test_a_message_plus_changes_gives_the_next_message(before: dict[str, Any], now: dict[str, Any]) -> None:
     said = changes(before, now)
     assert merged(before, said) == now
     assert changes(before, merged(before, said)) == said
@@ -194,7 +196,9 @@ async def view(pictures: list[tuple[dict[str, Any], int]], begin: int) -> None:
 
 @pytest.mark.slow
 @given(st.lists(st.tuples(plants, st.integers(0, 9)), min_size=2, max_size=12), st.integers(0, 2**32))
-def test_a_viewer_may_skip_messages(pictures: list[tuple[dict[str, Any], int]], begin: int) -> None:
+def test_viewers_get_correct_values_although_they_skip_messages(
+    pictures: list[tuple[dict[str, Any], int]], begin: int
+) -> None:
     """The frames' revision number changes in the middle of the run."""
     asyncio.run(view(pictures, begin))
 
@@ -233,7 +237,9 @@ async def test_too_many_viewers_get_an_error(frames: Frames, monkeypatch: pytest
     assert json.loads(sent[1]["body"]) == {"error": "too many viewers; the limit is 0"}
 
 
-def test_messages_are_made_after_the_alarm_check(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_alarms_are_checked_before_a_message_to_the_page_is_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """At most every 0.2 s, the gateway checks drives for alarms and then makes a message to the page."""
     gateway = Gateway(written(tmp_path), ServeSettings(port=0))
     gateway.listener.close()

@@ -97,7 +97,7 @@ def test_values_of_registers_are_unknown_before_their_first_request(hub: Hub) ->
     assert hub.state("pump-9") == "unknown"
 
 
-def test_the_time_of_the_newest_row_follows_a_clock_that_is_set_back(hub: Hub) -> None:
+def test_the_time_of_the_newest_row_goes_back_with_the_clock(hub: Hub) -> None:
     hub.take(rows((10, FREQUENCY, 25)))
     assert hub.time == UTC_0 + 10 * PERIOD
     hub.take(rows((11, FREQUENCY, 25), utc_0=UTC_0 - 3600 * SECOND))
@@ -106,7 +106,7 @@ def test_the_time_of_the_newest_row_follows_a_clock_that_is_set_back(hub: Hub) -
     assert hub.time == UTC_0 - 3600 * SECOND + 11 * PERIOD
 
 
-def test_a_failed_read_does_not_replace_the_last_good_row(hub: Hub) -> None:
+def test_a_failed_read_does_not_replace_the_last_good_value(hub: Hub) -> None:
     hub.take(rows((10, FREQUENCY, 25), (11, FREQUENCY, Status.NO_REPLY)))
     sent, missed = 10 * PERIOD, 11 * PERIOD
     good = next(good for one, _, good, _ in hub.known("pump-1") if one.name == "output_frequency")
@@ -119,7 +119,9 @@ def test_a_failed_read_does_not_replace_the_last_good_row(hub: Hub) -> None:
     ("status", "frequency", "state"),
     [(FORWARD, 25, "runs"), (FORWARD, 0, "runs"), (STANDBY, 0, "stands"), (2, 25, "runs"), (9, 0, "unknown")],
 )
-def test_a_status_register_gives_the_state(hub: Hub, status: int, frequency: int, state: str) -> None:
+def test_the_status_register_determines_the_state_of_a_drive(
+    hub: Hub, status: int, frequency: int, state: str
+) -> None:
     hub.take(all_of(10, status, frequency))
     assert hub.state("pump-1") == state
     assert hub.seen("pump-1").fault is None
@@ -157,7 +159,7 @@ def test_a_drive_is_silent_after_many_lost_replies_but_not_after_one(hub: Hub, c
     assert hub.state("pump-1") == "stands"
 
 
-def test_a_drive_that_answers_with_exceptions_is_not_silent(hub: Hub) -> None:
+def test_a_drive_is_not_silent_if_the_replies_are_exceptions(hub: Hub) -> None:
     columns = Columns(4)
     for register in range(4):
         layout = RowLayout(0, [Field(0, NumberFormat.U16, register, 1.0, 1.0)])
@@ -166,7 +168,7 @@ def test_a_drive_that_answers_with_exceptions_is_not_silent(hub: Hub) -> None:
     assert hub.state("pump-1") == "unknown"
 
 
-def test_a_port_counts_as_lost_if_the_newest_row_of_each_register_says_so(hub: Hub, clock: HubClock) -> None:
+def test_a_port_counts_as_lost_if_all_newest_rows_say_line_lost(hub: Hub, clock: HubClock) -> None:
     hub.take(all_of(10, FORWARD, 25))
     assert lost_of(hub, "hall") is None
     hub.take(rows(*((30, register, Status.LINE_LOST) for register in range(3))))
@@ -190,7 +192,7 @@ def test_values_become_stale_if_no_new_rows_arrive(hub: Hub, clock: HubClock) ->
     assert hub.seen("pump-1") == Shown("unknown", NOT_ASKED)
 
 
-def test_values_read_before_the_machine_slept_are_stale(hub: Hub, clock: HubClock) -> None:
+def test_values_are_stale_if_the_computer_slept_since_they_were_read(hub: Hub, clock: HubClock) -> None:
     """The monotonic clock stops while the machine sleeps, so the rows' ages do not include the sleep."""
     hub.take(all_of(10, FORWARD, 25))
     assert hub.state("pump-1") == "runs"
@@ -207,14 +209,14 @@ def test_values_read_before_the_machine_slept_are_stale(hub: Hub, clock: HubCloc
     assert hub.state("pump-1") == "runs"
 
 
-def test_a_sleep_of_the_machine_before_the_start_makes_no_value_stale(tmp_path: Path) -> None:
+def test_values_are_fresh_if_the_computer_slept_before_the_start(tmp_path: Path) -> None:
     hub = Hub(written(tmp_path), lambda: (20 * PERIOD, 8 * 3600 * SECOND))
     hub.take(all_of(19, FORWARD, 25))
     assert is_fresh(hub)
     assert hub.woke_ns() == 0
 
 
-def test_a_pause_between_readings_of_two_clocks_is_not_mistaken_for_sleep(tmp_path: Path) -> None:
+def test_a_small_difference_between_two_clocks_does_not_count_as_sleep(tmp_path: Path) -> None:
     slept = [0]
     hub = Hub(written(tmp_path), lambda: (20 * PERIOD, slept[0]))
     hub.take(all_of(19, FORWARD, 25))
@@ -249,7 +251,7 @@ def test_values_of_an_overloaded_line_stay_fresh_for_three_cycles(tmp_path: Path
     assert not is_fresh(hub)
 
 
-def test_the_last_minute_has_one_point_a_second_and_null_for_failed_reads(hub: Hub) -> None:
+def test_the_last_minute_of_values_has_one_point_per_second(hub: Hub) -> None:
     assert hub.last_minute() == {}
     for at in range(0, 1000, 5):  # time in units of 100 ms, so 100 s in all
         hub.take(rows((at, FREQUENCY, Status.NO_REPLY if at == 990 else at)))
@@ -266,7 +268,7 @@ def test_rows_of_a_removed_drive_are_ignored(hub: Hub) -> None:
     assert "pump-9" not in list(hub.drives)
 
 
-def test_a_reload_keeps_the_rows_of_unchanged_drives(hub: Hub) -> None:
+def test_a_reload_keeps_the_values_of_unchanged_drives(hub: Hub) -> None:
     hub.take(all_of(10, FORWARD, 25))
     hub.adopt(hub.plant)
     assert hub.state("pump-1") == "runs"
@@ -320,7 +322,9 @@ def test_each_alarm_starts_and_ends_once(shown: list[Shown]) -> None:
 
 
 @pytest.mark.parametrize(("status", "is_over"), [(STANDBY, True), (9, True), (TRIPPED, False)])
-def test_a_fault_outlasts_unknown_values(hub: Hub, clock: HubClock, status: int, is_over: bool) -> None:
+def test_a_fault_alarm_continues_while_the_status_is_unknown(
+    hub: Hub, clock: HubClock, status: int, is_over: bool
+) -> None:
     """A busy line may read other registers but not the status for a second. The fault may still be active."""
     events = Alarms()
 
@@ -339,14 +343,14 @@ def test_a_fault_outlasts_unknown_values(hub: Hub, clock: HubClock, status: int,
     assert look() == [(10, 31 if is_over else None)]
 
 
-def test_a_fault_whose_name_becomes_known_later_raises_no_second_alarm() -> None:
+def test_no_second_alarm_is_raised_when_the_name_of_a_fault_becomes_known() -> None:
     events = Alarms()
     for time, words in enumerate(("it shows a fault", "overcurrent", "it shows a fault"), 1):
         events.look(time, "pump-1", Shown("fault", words))
     assert [(one.time, one.text, one.ended) for one in events.shown()] == [(1, "overcurrent", None)]
 
 
-def test_the_number_of_ended_alarms_that_are_kept_is_limited() -> None:
+def test_the_number_of_ended_alarms_in_memory_is_limited() -> None:
     events = Alarms(since=7)
     for time in range(4000):
         events.look(time, "pump-1", Shown("fault", "a") if time % 2 else Shown("runs", None))
@@ -376,7 +380,7 @@ def test_the_web_page_gets_null_for_overdue_or_failed_values(hub: Hub, clock: Hu
         assert published_values(hub, "pump-1") == said  # the values that MQTT publishes
 
 
-def test_the_age_of_a_value_is_correct_despite_a_clock_change_or_a_sleep(hub: Hub, clock: HubClock) -> None:
+def test_the_age_of_a_value_is_correct_after_a_clock_change_or_sleep(hub: Hub, clock: HubClock) -> None:
     """If the age were too small, the last value of a silent drive would look new."""
     hub.take(rows((10, FREQUENCY, 25), (20, FREQUENCY, Status.NO_REPLY)))
     asked_ns = UTC_0 + 10 * PERIOD
@@ -429,7 +433,7 @@ def number(words: list[int], at: int) -> int:
 
 
 @table("model", MODELS)
-def test_only_scaled_values_have_a_unit(model: str) -> None:
+def test_a_value_of_unknown_scale_has_the_unit_raw_count(model: str) -> None:
     drive = MODELS[model](1)
     for register in described(polled(drive, drive.readings()))["drives"][0]["registers"]:
         known = drive.registers[register["name"]]
@@ -441,7 +445,8 @@ def test_only_scaled_values_have_a_unit(model: str) -> None:
             assert (register["at_least"], register["at_most"]) == (known.at_least, known.at_most)
 
 
-def test_the_registers_common_to_all_drives_have_no_value_of_unknown_scale() -> None:
+def test_common_modbus_registers_hide_values_of_unknown_scale() -> None:
+    """The Modbus server has the same registers, such as the frequency in 0.01 Hz, for every drive."""
     delixi, che = DelixiModbus(1, name="fan"), InvtCHE(2, name="pump", maximum_frequency=50)
     names = ("output_frequency", "output_current")
     drives = [polled(drive, [drive.registers[name] for name in names]) for drive in (delixi, che)]
@@ -479,7 +484,7 @@ def test_prometheus_metrics_are_in_base_units() -> None:
     assert base_unit(InvtCHE(1).status).name == "code"
 
 
-def test_home_assistant_shows_a_number_of_unknown_scale_as_a_raw_count() -> None:
+def test_home_assistant_shows_values_of_unknown_scale_as_raw_counts() -> None:
     topics = dict.fromkeys(("set", "stop", "state", "gateway", "available"), "topic")
     details = {"prefix": "", "version": "1", "every_s": 1.0, "writable": ["pressure"], "takes_commands": True}
     found = json.loads(discovery(Fan(1), [Fan.pressure], topics, **details))  # type: ignore[arg-type]
@@ -514,7 +519,7 @@ def test_home_assistant_gets_no_display_precision_for_a_float_register() -> None
     assert [parts[f"{name}_set"]["step"] for name in ("pressure", "level")] == [0.001, 0.01]
 
 
-def test_a_reload_adapts_the_age_limit_of_values_to_the_line(clock: HubClock) -> None:
+def test_a_reload_that_adds_drives_lets_values_stay_fresh_longer(clock: HubClock) -> None:
     """A reload adds drives to a line, and removes them. The first drive stays the same object."""
     first = polled(InvtCHE(1, name="pump-1"), [InvtCHE.output_frequency])
     others = [polled(InvtCHE(address), InvtCHE.readings()) for address in range(2, 20)]
@@ -527,7 +532,7 @@ def test_a_reload_adapts_the_age_limit_of_values_to_the_line(clock: HubClock) ->
     assert (Hub(crowded).holds_s("pump-1", "output_frequency") or 0.0) > 2.0
 
 
-def test_ages_in_prometheus_metrics_include_sleep(
+def test_ages_in_prometheus_metrics_include_the_time_of_computer_sleep(
     hub: Hub, clock: HubClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hub.take(rows((10, FREQUENCY, 25)))

@@ -68,12 +68,13 @@ def test_a_command_is_refused_if_its_sender_saw_only_old_values(times: Times) ->
     assert times.rule(7, command="jog") == TOO_LATE
 
 
-def test_a_command_with_an_unknown_message_number_is_refused(times: Times) -> None:
+def test_a_command_is_refused_if_its_message_number_was_never_sent(times: Times) -> None:
+    """Each message to the web page has a number. A command states the number of the newest seen message."""
     times.frames.note(7)
     assert [times.rule(seen) for seen in (8, 6, -1, 0)] == [TOO_LATE] * 4
 
 
-def test_a_stop_invalidates_earlier_commands_of_its_own_drive_only(times: Times) -> None:
+def test_a_stop_of_one_drive_invalidates_only_its_earlier_commands(times: Times) -> None:
     times.frames.note(7)
     times.stopped["pump-1"] = times.now_ns  # the same time as the frame, so the stop may have been later
     assert times.rule(7) == commands_module.OVERTAKEN
@@ -93,7 +94,8 @@ def test_a_command_is_refused_if_its_sender_saw_no_values_since_a_reload(times: 
     assert times.rule(7) == ANOTHER_PLANT
 
 
-def test_a_repeated_command_with_the_same_message_number_is_refused(times: Times) -> None:
+def test_a_command_is_refused_if_repeated_with_the_same_message_number(times: Times) -> None:
+    """A command states the number of the newest message that its sender saw, here 7 or 8."""
     times.frames.note(7)
     assert [times.rule(7, command=one) for one in ("start", "jog", "start")] == ["", "", DOUBLED]
     times.frames.note(8)
@@ -162,7 +164,7 @@ def test_a_delayed_command_is_not_sent(tmp_path: Path, path: str, body: dict[str
         assert commands(gateway) == []
 
 
-def test_a_stop_is_sent_however_long_the_network_delayed_it(tmp_path: Path) -> None:
+def test_a_stop_is_sent_after_any_network_delay(tmp_path: Path) -> None:
     with served(tmp_path, MAY) as gateway:
         gateway.start("pump-1")
         with held_up(gateway, "/api/stop", {"drives": None}) as client:
@@ -192,7 +194,7 @@ def test_a_start_is_not_sent_if_its_sender_saw_no_values_since_a_stop(tmp_path: 
         assert gateway.act("pump-1", "start")["done"] is True
 
 
-def test_a_command_that_waited_too_long_for_its_thread_is_not_sent(tmp_path: Path) -> None:
+def test_a_command_is_not_sent_if_its_thread_starts_too_late(tmp_path: Path) -> None:
     begun: list[threading.Thread] = []
 
     class Late(threading.Thread):
@@ -214,7 +216,9 @@ def test_a_command_that_waited_too_long_for_its_thread_is_not_sent(tmp_path: Pat
         assert commands(gateway) == []
 
 
-def test_a_stop_right_before_a_start_prevents_it(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_start_is_not_sent_if_a_stop_was_called_just_before(
+    gateway: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
     act, before = commands_module.carry_out_verb, commands(gateway)
 
     def act_after_a_stop(drive: Drive, **given: Any) -> CommandResult:
@@ -228,7 +232,7 @@ def test_a_stop_right_before_a_start_prevents_it(gateway: Served, monkeypatch: p
 
 
 @pytest.mark.slow
-def test_a_message_number_of_a_previous_process_is_refused(tmp_path: Path) -> None:
+def test_a_command_is_refused_if_its_message_number_is_from_before_a_restart(tmp_path: Path) -> None:
     with served(tmp_path, MAY) as gateway:
         seen = gateway.frame_number()
     with served(tmp_path, MAY) as gateway:
@@ -240,7 +244,9 @@ def test_a_message_number_of_a_previous_process_is_refused(tmp_path: Path) -> No
 
 
 @table("wrong", [{}, {"seen": None}, {"seen": "7"}, {"seen": True}, {"seen": 1.5}, {"seen": 10**300}])
-def test_a_command_without_a_message_number_is_refused(gateway: Served, wrong: dict[str, Any]) -> None:
+def test_a_command_is_refused_without_the_number_of_the_last_seen_message(
+    gateway: Served, wrong: dict[str, Any]
+) -> None:
     before, called = commands(gateway), gateway.gateway.commands.called
     verbs = {"start": {}, "jog": {}, "reset_fault": {}, "set_frequency": {"hz": 20.0}}
     acts = [{"drive": "pump-1", "verb": verb, "options": options} for verb, options in verbs.items()]
@@ -250,7 +256,7 @@ def test_a_command_without_a_message_number_is_refused(gateway: Served, wrong: d
     assert (commands(gateway), gateway.gateway.commands.called) == (before, called)
 
 
-def test_a_stop_needs_no_message_number(gateway: Served) -> None:
+def test_a_stop_is_accepted_without_the_number_of_the_last_seen_message(gateway: Served) -> None:
     for verb in ("stop", "coast"):
         told = gateway.post("/api/act", {"drive": "pump-1", "verb": verb, "options": {}}).json
         assert told["done"] is True

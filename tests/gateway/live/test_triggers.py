@@ -64,7 +64,7 @@ def test_a_trigger_fires_once_when_its_condition_becomes_true(tmp_path: Path) ->
     }
 
 
-def test_a_fault_of_any_drive_fires_a_trigger_and_the_newest_is_listed_first(tmp_path: Path) -> None:
+def test_a_fault_of_any_drive_fires_the_trigger_fault(tmp_path: Path) -> None:
     found = triggers(tmp_path, {"any": "fault", "fast": "pump-1.output_frequency > 40"})
     for drive in (0, 1):
         found.take(rows((1, "fault", 0.0), (2, "fault", 0.0), drive=drive))
@@ -86,7 +86,7 @@ def test_a_trigger_condition_uses_values_of_a_computed_channel_in_time_order(tmp
     assert moments(found) == {"odd": 4.0}
 
 
-def test_after_a_reload_conditions_are_evaluated_with_the_new_plant(tmp_path: Path) -> None:
+def test_trigger_conditions_use_the_new_plant_after_a_reload(tmp_path: Path) -> None:
     found = triggers(tmp_path, {"trip": "pump-1.output_current > 30"})
     found.take(rows((1, "output_current", 1.0)))
 

@@ -22,7 +22,7 @@ LEAST = {"frames": 100, "scrapes": 5, "queries": 5, "messages": 200, "reads": 10
 
 
 @pytest.mark.long
-def test_a_gateway_stays_healthy_with_all_kinds_of_users_together(tmp_path: Path) -> None:
+def test_a_gateway_stays_healthy_while_users_of_all_kinds_are_connected(tmp_path: Path) -> None:
     """Five viewers, ten clients that read no answers, Prometheus, history, MQTT, and two Modbus masters."""
     require_module("paho.mqtt.client")
     with ExitStack() as stack:

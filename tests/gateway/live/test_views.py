@@ -87,7 +87,7 @@ def test_a_line_is_described_with_the_baud_rates_of_all_its_drives() -> None:
     assert [drive["speed"] for drive in told["drives"]] == ["38400 8N1", "9600 8N1", "9600 8N1"]
 
 
-def test_the_web_page_gets_the_age_of_each_value(gateway: Served) -> None:
+def test_messages_to_the_web_page_contain_the_age_of_each_value(gateway: Served) -> None:
     gateway.sims["pump-1"]["output_current"] = 12.3
     frame: dict[str, Any] = {}
 
@@ -155,7 +155,9 @@ def test_values_of_a_silent_drive_are_marked_as_old(gateway: Served) -> None:
 
 
 @pytest.mark.long
-def test_unpolled_registers_are_read_for_viewers(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unpolled_registers_are_read_while_a_user_views_the_drive(
+    gateway: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(drive_reads, "PAUSE_S", 0.0)
     monkeypatch.setattr(drive_reads, "SHARE", 0)
     gateway.sims["pump-1"]["dc_bus_voltage"] = 537.0
@@ -176,7 +178,7 @@ def test_unpolled_registers_are_read_for_viewers(gateway: Served, monkeypatch: p
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_viewing_a_silent_drive_reads_none_of_its_unpolled_registers(gateway: Served) -> None:
+def test_unpolled_registers_are_not_read_from_a_silent_drive(gateway: Served) -> None:
     gateway.sims["pump-2"].deaf_until = float("inf")
     gateway.await_state("pump-2", "silent")
     asked: list[object] = []
@@ -222,7 +224,7 @@ def test_failed_reads_of_a_silent_drive_are_counted_per_value(gateway: Served) -
     assert drive["asked"] >= sum(drive["misses"].values()) + before
 
 
-def test_a_drive_shows_the_eeprom_writes_of_its_own_port_address_and_family_only(gateway: Served) -> None:
+def test_eeprom_writes_of_another_port_address_or_family_are_not_shown(gateway: Served) -> None:
     """Another drive may have the same address on another port, or may have had this address before."""
     drive = gateway.gateway.plant.find_drive("pump-1")[1]
     assert gateway.gateway.poller
@@ -305,7 +307,7 @@ def test_the_last_hour_has_60_minutes_of_statistics(recent: RecentStatistics) ->
     assert recent.hour("roof") == []
 
 
-def test_the_statistics_of_a_line_leave_out_old_readings(recent: RecentStatistics) -> None:
+def test_statistics_of_a_line_exclude_old_readings(recent: RecentStatistics) -> None:
     for second in range(200):
         recent.tick(float(second), second * 1000, {"hall": reading(second)})
         if second == 100:
@@ -341,7 +343,7 @@ def test_statistics_of_a_line_without_replies_are_none(recent: RecentStatistics,
     assert delays.samples == [("_count", {"line": "hall", "drive": "pump-1"}, 0.0)]
 
 
-def test_a_reopened_line_has_statistics_from_its_second_reading_on(recent: RecentStatistics) -> None:
+def test_a_reopened_line_has_no_rate_before_its_second_reading(recent: RecentStatistics) -> None:
     recent.tick(100.0, 100_000, {"hall": replace(reading(100), epoch=1)})
     recent.tick(101.0, 101_000, {"hall": replace(reading(1), epoch=2)})
     assert (recent.line("hall")["rate"], recent.line("hall")["used"]) == (None, None)
@@ -349,7 +351,7 @@ def test_a_reopened_line_has_statistics_from_its_second_reading_on(recent: Recen
     assert recent.line("hall")["rate"] == 10.0
 
 
-def test_no_polling_rate_becomes_negative_when_a_drive_is_removed(recent: RecentStatistics) -> None:
+def test_the_polling_rate_is_not_negative_after_a_drive_is_removed(recent: RecentStatistics) -> None:
     recent.tick(100.0, 100_000, {"hall": reading(100)})
     recent.tick(101.0, 101_000, {"hall": replace(reading(1), seconds=101.0)})
     assert recent.line("hall")["rate"] == 0.0
@@ -362,7 +364,9 @@ MAY_STOP = '[serve.may]\nstop = "anyone"\n'
 
 
 @pytest.mark.long
-def test_a_stop_is_sent_without_reading_the_identity(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_is_sent_without_reading_the_identity_of_the_drive(
+    tmp_path: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """No identity is read between the call of the stop and the Modbus request that stops the drive."""
     asked: list[str] = []
     with served(tmp_path, MAY_STOP) as gateway:
@@ -437,7 +441,7 @@ def test_a_known_identity_is_not_read_again() -> None:
 
 
 @pytest.mark.usefixtures("_at_once")
-def test_a_wrong_identity_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_drive_of_the_wrong_family_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
     stranger = WriteForbidden(
         "nothing is written to fan-1, so it is not a CHE", rule="it does not look like its family"
     )

@@ -253,7 +253,7 @@ def check_common_block(rows: list[dict[str, Any]], shown: dict[str, list[Any]], 
 
 
 @pytest.mark.slow
-def test_clients_can_write_only_the_rows_that_the_address_map_marks_writable(tmp_path: Path) -> None:
+def test_clients_can_write_only_rows_marked_writable_in_the_address_map(tmp_path: Path) -> None:
     with served(tmp_path) as (gateway, _), closing(Client("pymodbus", tmp_path)) as client:
         rows = get(gateway, "/api/modbus-map")
         assert [row["name"] for row in rows if "write" in row["access"]] == [
@@ -266,7 +266,7 @@ def test_clients_can_write_only_the_rows_that_the_address_map_marks_writable(tmp
 
 @pytest.mark.slow
 @pytest.mark.parametrize("master", usually(*MASTERS))
-def test_each_modbus_master_can_write_and_stop_a_drive(tmp_path: Path, master: str) -> None:
+def test_each_modbus_master_can_write_a_register_and_stop_a_drive(tmp_path: Path, master: str) -> None:
     with served(tmp_path) as (gateway, drive), closing(Client(master, tmp_path)) as client:
         rows = get(gateway, "/api/modbus-map")
         row = next(row for row in rows if row["drive"] == "mill")
@@ -305,7 +305,7 @@ def test_http_and_cli_give_the_same_address_map(tmp_path: Path, capsys: pytest.C
     assert "map.xls: the name of an address map must end in .csv or .json" in capsys.readouterr().err
 
 
-def test_the_address_map_shows_the_invalid_values_and_bits_of_registers(tmp_path: Path) -> None:
+def test_the_address_map_lists_invalid_values_and_bits_of_registers(tmp_path: Path) -> None:
     (tmp_path / "mixed.toml").write_text(FAMILY)
     (tmp_path / "plant.toml").write_text(PLANT.format(passing="declared", hall="/dev/a", yard="/dev/b"))
     assert main(["serve", str(tmp_path / "plant.toml"), "--modbus-map", str(tmp_path / "map.json")]) == 0

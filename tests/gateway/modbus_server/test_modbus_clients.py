@@ -83,7 +83,7 @@ def transactions(written: bytes) -> list[int]:
     return found
 
 
-async def test_the_answers_have_the_ids_of_their_requests_and_are_sent_when_ready() -> None:
+async def test_modbus_answers_are_sent_in_the_order_they_become_ready() -> None:
     async def slow(found: MbapRequest) -> bytes:
         await asyncio.sleep(found.transaction)
         return found.reply(bytes([found.transaction]))
@@ -95,7 +95,9 @@ async def test_the_answers_have_the_ids_of_their_requests_and_are_sent_when_read
     assert [transport.written[at + 8] for at in (0, 9, 18)] == [1, 2, 3]
 
 
-async def test_an_internal_error_is_answered_with_an_exception(caplog: pytest.LogCaptureFixture) -> None:
+async def test_an_internal_error_is_answered_with_a_modbus_exception(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     async def fails(found: MbapRequest) -> bytes:
         raise RuntimeError("a mistake of ours")
 
@@ -124,7 +126,7 @@ def slowly(found: MbapRequest, _: ModbusClient) -> bytes:
     return found.reply(b"")
 
 
-async def test_busy_clients_share_the_time_slice_of_one_event_loop_cycle() -> None:
+async def test_all_busy_modbus_clients_share_one_time_slice_per_loop_cycle() -> None:
     """A stop may have to wait for one cycle, in which each client has a turn."""
     share = modbus_server.RoundShare()
     clock = cast(ControlledLoop, asyncio.get_running_loop()).passing
@@ -144,7 +146,7 @@ async def test_busy_clients_share_the_time_slice_of_one_event_loop_cycle() -> No
     assert share.slice_s == modbus_server.SLICE_S
 
 
-async def test_invalid_bytes_close_the_connection_after_earlier_requests_are_answered() -> None:
+async def test_invalid_bytes_close_a_modbus_connection_after_earlier_answers() -> None:
     port = port_of()
     client, transport = connected(port)
     _, other = connected(port)
@@ -153,7 +155,7 @@ async def test_invalid_bytes_close_the_connection_after_earlier_requests_are_ans
     assert (transport.ended, other.ended) == ("closed", "")
 
 
-async def test_a_client_that_reads_no_answers_is_disconnected() -> None:
+async def test_a_modbus_client_is_disconnected_if_it_reads_no_answers() -> None:
     port = port_of()
     client, transport = connected(port)
     client.pause_writing()
@@ -184,7 +186,7 @@ def writes(first: int, end: int) -> bytes:
 
 
 @pytest.mark.parametrize("is_stalled", [False, True])
-async def test_a_clients_writes_start_in_order_and_before_waiting_reads(is_stalled: bool) -> None:
+async def test_modbus_writes_start_before_waiting_reads_of_the_same_client(is_stalled: bool) -> None:
     begun: list[int] = []
 
     def noted(found: MbapRequest, _: ModbusClient) -> bytes:
@@ -215,7 +217,7 @@ async def test_a_long_queue_of_requests_is_answered_in_several_steps(
     assert transport.is_reading
 
 
-def test_the_number_of_requests_of_a_client_that_reads_no_answers_is_limited(
+def test_excess_read_requests_are_dropped_if_a_client_reads_no_answers(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(modbus_server, "MOST_UNTAKEN", 4096)
@@ -272,7 +274,7 @@ async def test_an_idle_client_is_disconnected_unless_it_waits_for_an_answer() ->
     never.cancel()
 
 
-async def test_a_client_beyond_the_limit_replaces_the_client_that_is_idle_longest() -> None:
+async def test_a_new_client_replaces_the_longest_idle_client_at_the_limit() -> None:
     port = port_of()
     found = []
     for _ in range(modbus_server.MOST_CLIENTS):
@@ -288,7 +290,7 @@ async def test_a_client_beyond_the_limit_replaces_the_client_that_is_idle_longes
     assert port.refused == 1
 
 
-async def test_a_client_whose_address_is_not_listed_is_refused() -> None:
+async def test_a_modbus_client_is_refused_if_its_address_is_not_listed() -> None:
     port = port_of()
     assert connected(port, "10.0.0.1")[1].ended == "aborted"
     assert not port.clients
@@ -315,7 +317,7 @@ async def test_an_answer_in_progress_is_cancelled_if_its_client_disconnects() ->
     assert (transport.written, port.clients) == (b"", set())
 
 
-async def test_a_client_that_closed_its_sending_side_still_gets_its_answers() -> None:
+async def test_a_client_gets_answers_after_closing_its_sending_side() -> None:
     async def slow(found: MbapRequest) -> bytes:
         await asyncio.sleep(1)
         return found.reply(b"")
@@ -357,7 +359,7 @@ def test_reset_connections_do_not_affect_other_clients() -> None:
 
 
 @pytest.mark.long
-def test_a_stop_waits_neither_for_earlier_requests_nor_until_answers_are_read() -> None:
+def test_a_stop_is_sent_although_its_client_reads_no_answers() -> None:
     plant = plant_of(("hall", InvtCHE(1, name="mill")))
     with serving(plant, ModbusSettings(listen="127.0.0.1:0", may="stop")) as gateway:
         stopped = threading.Event()
@@ -480,7 +482,7 @@ def test_each_of_a_million_answers_has_the_transaction_id_of_its_request(gateway
 
 
 @pytest.mark.long
-def test_a_client_that_reads_its_answers_late_gets_all_of_them(gateway: Gateway) -> None:
+def test_a_client_gets_all_answers_although_it_reads_them_late(gateway: Gateway) -> None:
     """The client sends all requests before it reads any answer. Until then, the server keeps the answers."""
     requests = 20_000
     with gateway.client() as client:
@@ -562,7 +564,7 @@ async def test_clients_get_a_limited_share_of_bus_time_in_each_second() -> None:
         assert len(window) * 0.01 <= SHARE + BURST_S + 0.01 + 1e-6
 
 
-async def test_a_ninth_request_that_waits_for_the_line_is_refused_immediately() -> None:
+async def test_a_request_is_refused_if_eight_others_wait_for_the_line() -> None:
     share, line = LineShare(), PacedLine(0.5)
     # one request in progress, and MOST_WAITING waiting requests
     asked = [share.ask("one", line.ask) for _ in range(1 + MOST_WAITING)]
@@ -575,7 +577,7 @@ async def test_a_ninth_request_that_waits_for_the_line_is_refused_immediately() 
     assert all(isinstance(result, PassingBusy) for result in results[1:])
 
 
-async def test_a_request_that_waited_a_second_for_the_line_is_dropped() -> None:
+async def test_a_request_is_dropped_after_waiting_a_second_for_the_line() -> None:
     loop = asyncio.get_running_loop()
     share, line = LineShare(), PacedLine(1.5)
     first, second = share.ask("one", line.ask), share.ask("two", line.ask)
@@ -588,7 +590,7 @@ async def test_a_request_that_waited_a_second_for_the_line_is_dropped() -> None:
     assert len(line.begun) == 1
 
 
-async def test_each_request_is_sent_to_the_line_with_the_time_left_until_it_expires() -> None:
+async def test_each_request_to_a_line_has_the_remaining_time_before_expiry() -> None:
     share, line = LineShare(), PacedLine(0.15)
     first, second = share.ask("one", line.ask), share.ask("one", line.ask)
     await asyncio.gather(first, second)
@@ -617,7 +619,7 @@ async def test_waiting_requests_of_a_disconnected_client_are_dropped() -> None:
     assert line.begun[1] - line.begun[0] >= 0.1
 
 
-async def test_a_failed_request_raises_for_its_own_client_and_the_next_one_is_sent() -> None:
+async def test_the_next_request_is_sent_after_a_failed_request() -> None:
     async def fails(left: float) -> list[int]:
         raise TimeoutError("no reply")
 

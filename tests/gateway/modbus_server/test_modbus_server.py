@@ -113,20 +113,20 @@ def test_bits_read_from_a_drive_are_packed_with_the_first_bit_lowest() -> None:
         assert client.ask(2, 2, 1, 10).data == bytes([2, 0b01010101, 0b01])
 
 
-def test_undeclared_addresses_are_refused_by_default(gateway: Gateway) -> None:
+def test_modbus_reads_of_undeclared_addresses_are_refused_by_default(gateway: Gateway) -> None:
     assert code(gateway, 1, 3, 0x7000, 1) == 2
     assert code(gateway, 1, 4, CHE_OUTPUT_VOLTAGE, 1) == 2  # this register is declared only for function 3
     assert code(gateway, 4, 3, 0, 1) == 2  # the drive of unit id 4 does not use Modbus
     assert gateway.line.asked == []
 
 
-def test_undeclared_registers_can_be_read_if_all_reads_are_passed_on() -> None:
+def test_undeclared_registers_can_be_read_if_the_settings_allow_any_read() -> None:
     with serving(plant(), ModbusSettings(listen="127.0.0.1:0", passing="any")) as gateway:
         assert code(gateway, 1, 4, 0x7000, 2) is None
         assert gateway.line.asked == [("mill", 4, 0x7000, 2)]
 
 
-def test_a_read_causes_no_request_on_the_line_if_none_is_passed_on() -> None:
+def test_modbus_reads_send_nothing_to_drives_if_passing_is_off() -> None:
     with serving(plant(), ModbusSettings(listen="127.0.0.1:0", passing="off")) as gateway:
         gateway.hub.values["mill", "output_voltage"] = 231.0
         assert code(gateway, 1, 3, CHE_OUTPUT_VOLTAGE, 1) is None
@@ -183,7 +183,9 @@ def test_invalid_address_ranges_are_answered_with_exception_codes(
 
 @table("function", [1, 3, 5, 6])
 @table("data", [b"", b"\0", b"\0\0\0", b"\0\0\0\1\0"])
-def test_a_request_of_wrong_length_is_an_illegal_value(gateway: Gateway, function: int, data: bytes) -> None:
+def test_a_request_of_wrong_length_is_answered_with_illegal_data_value(
+    gateway: Gateway, function: int, data: bytes
+) -> None:
     assert code(gateway, 1, function, data=data) == 3
 
 
@@ -204,7 +206,9 @@ def test_an_unknown_unit_id_is_answered_with_gateway_path_unavailable(gateway: G
 
 
 @table("function", [3, 5, 6, 16, 8])
-def test_a_broadcast_closes_the_connection_and_is_not_passed_on(gateway: Gateway, function: int) -> None:
+def test_a_modbus_broadcast_closes_the_connection_and_reaches_no_drive(
+    gateway: Gateway, function: int
+) -> None:
     with gateway.client() as client:
         client.send(request(1, 0, function, BLOCK + 10, 1))
         assert client.receive() is None
@@ -248,7 +252,7 @@ def test_reads_beyond_the_clients_share_of_bus_time_are_answered_busy(gateway: G
     assert len(gateway.line.asked) == 1  # No bus time is left for 2 s, so the other reads expire.
 
 
-def test_a_write_is_carried_out_by_the_gateways_commands_and_echoed(gateway: Gateway) -> None:
+def test_a_modbus_write_becomes_a_command_and_is_echoed(gateway: Gateway) -> None:
     with gateway.client() as client:
         assert client.ask(1, 6, CHE_SETPOINT, 5000).data == bytes.fromhex("20 00 13 88")
         reply = client.ask(1, 16, CHE_SETPOINT, 1, data=bytes.fromhex("02 13 88"))
@@ -302,7 +306,7 @@ def test_invalid_writes_are_refused(
 
 
 @table(("address", "words"), [(CHE_CONTROL, (1, 5)), (CHE_CONTROL - 1, (5, 1)), (CHE_SETPOINT, (5, 5))])
-def test_a_write_of_two_registers_is_refused_unless_it_contains_a_stop(
+def test_a_write_of_two_registers_without_a_stop_is_refused(
     gateway: Gateway, address: int, words: tuple[int, int]
 ) -> None:
     assert code(gateway, 1, 16, address, 2, data=struct.pack(">B2H", 4, *words)) in (2, 3)
@@ -336,7 +340,7 @@ def test_a_client_gets_the_exception_code_for_its_failed_write(
     assert code(gateway, 1, 6, CHE_SETPOINT, 5000) == expected
 
 
-def test_a_write_that_waited_while_the_gateway_was_suspended_is_refused(gateway: Gateway) -> None:
+def test_a_write_is_refused_if_the_gateway_was_suspended_meanwhile(gateway: Gateway) -> None:
     standstill, now_ns = gateway.server._standstill, [10**12]
     with gateway.client() as client:
         standstill._clock = lambda: now_ns[0]
@@ -366,7 +370,7 @@ def test_a_read_only_gateway_refuses_writes_as_illegal_function() -> None:
         assert (gateway.commands.written, gateway.commands.stopped) == ([], [])
 
 
-def test_clients_with_the_right_to_stop_can_only_stop() -> None:
+def test_modbus_clients_with_the_right_to_stop_can_only_stop() -> None:
     with serving(plant(), ModbusSettings(listen="127.0.0.1:0", may="stop")) as gateway:
         for address, value in ((CHE_SETPOINT, 5000), (CHE_CONTROL, 1), (0x7000, 1)):
             assert code(gateway, 1, 6, address, value) == 1
@@ -377,12 +381,14 @@ def test_clients_with_the_right_to_stop_can_only_stop() -> None:
 
 
 @table("value", [v for v in range(20) if v not in (5, 6, 8)])
-def test_a_control_register_accepts_only_values_that_stop(gateway: Gateway, value: int) -> None:
+def test_modbus_clients_can_write_only_stop_values_to_a_control_register(
+    gateway: Gateway, value: int
+) -> None:
     assert code(gateway, 1, 6, CHE_CONTROL, value) == 3
     assert (gateway.commands.written, gateway.commands.stopped) == ([], [])
 
 
-def test_each_write_that_means_stop_calls_a_stop(gateway: Gateway) -> None:
+def test_a_modbus_write_of_any_stop_value_stops_the_drive(gateway: Gateway) -> None:
     with gateway.client() as client:
         assert client.ask(1, 6, CHE_CONTROL, 5).data == bytes.fromhex("10 00 00 05")
         assert client.ask(1, 16, CHE_CONTROL, 1, data=bytes.fromhex("02 00 05")).code is None
@@ -452,7 +458,9 @@ class HeldCommands:
 
 
 @pytest.mark.parametrize("is_disconnected", [False, True])
-def test_a_slow_stop_is_acknowledged_and_continues(gateway: Gateway, is_disconnected: bool) -> None:
+def test_a_slow_modbus_stop_continues_after_its_acknowledgement(
+    gateway: Gateway, is_disconnected: bool
+) -> None:
     held = HeldCommands(gateway)
     with gateway.client() as client:
         client.send(request(1, 1, 6, CHE_CONTROL, 5))
@@ -465,7 +473,7 @@ def test_a_slow_stop_is_acknowledged_and_continues(gateway: Gateway, is_disconne
     assert held.ended.wait(PATIENCE)
 
 
-def test_a_stop_does_not_wait_for_earlier_requests_of_its_client(gateway: Gateway) -> None:
+def test_a_modbus_stop_does_not_wait_for_earlier_writes_of_its_client(gateway: Gateway) -> None:
     """Sixteen writes hang. The stop that the client sends after them is called immediately."""
     held = HeldCommands(gateway, only_writes=True)
     with gateway.client() as client:
@@ -483,7 +491,7 @@ def test_a_stop_does_not_wait_for_earlier_requests_of_its_client(gateway: Gatewa
         assert {reply.transaction for _ in range(16) if (reply := client.receive())} == set(range(16))
 
 
-def test_a_flood_of_stops_is_answered_and_its_last_stops_are_sent_as_one(
+def test_modbus_stops_beyond_a_limit_are_combined_into_one_stop(
     gateway: Gateway, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Only the first answers wait for their stops: thousands of waiting answers would delay other stops."""
@@ -510,12 +518,16 @@ def test_a_flood_of_stops_is_answered_and_its_last_stops_are_sent_as_one(
     ("failure", "expected"),
     [(BusError("not seen to stand"), 0x0B), (NoReply("mill"), 0x0B), (PortLost("/dev/x", "gone"), 0x0A)],
 )
-def test_a_failed_stop_has_an_exception_code(gateway: Gateway, failure: BusError, expected: int) -> None:
+def test_a_failed_modbus_stop_is_answered_with_an_exception_code(
+    gateway: Gateway, failure: BusError, expected: int
+) -> None:
     gateway.commands.told = CommandResult(CommandOutcome.FAILED, str(failure), failure)
     assert code(gateway, 1, 6, CHE_CONTROL, 5) == expected
 
 
-def test_an_unexpected_error_of_a_stop_is_logged(gateway: Gateway, caplog: pytest.LogCaptureFixture) -> None:
+def test_an_unexpected_error_during_a_modbus_stop_is_logged(
+    gateway: Gateway, caplog: pytest.LogCaptureFixture
+) -> None:
     async def fails() -> CommandResult:
         raise RuntimeError("a mistake of ours")
 
@@ -543,7 +555,8 @@ def block(gateway: Gateway, unit: int = 1, function: int = 3) -> list[int]:
 UNKNOWN = [0x8000, 0]
 
 
-def test_the_registers_common_to_all_drives_have_the_values_of_a_running_drive(gateway: Gateway) -> None:
+def test_common_modbus_registers_contain_the_values_of_a_running_drive(gateway: Gateway) -> None:
+    """The Modbus server has these registers at the same addresses for every drive."""
     gateway.hub.states["mill"] = "runs"
     gateway.hub.values.update(
         {("mill", "output_frequency"): 49.99, ("mill", "output_current"): 12.3, ("mill", "setpoint"): -5.0}
@@ -561,7 +574,7 @@ def test_the_registers_common_to_all_drives_have_the_values_of_a_running_drive(g
     assert block(gateway)[2:4] == [2, 0x49F0]  # 150000 has two words
 
 
-def test_unknown_values_in_the_common_registers_are_reserved_numbers(gateway: Gateway) -> None:
+def test_common_modbus_registers_mark_unknown_values_by_reserved_numbers(gateway: Gateway) -> None:
     gateway.hub.values.clear()
     assert block(gateway) == [0, 0xFFFF, *UNKNOWN, *UNKNOWN, *UNKNOWN, 0xFFFF, 0xFFFF, 0]
     gateway.hub.states["mill"] = "silent"
@@ -572,7 +585,8 @@ def test_unknown_values_in_the_common_registers_are_reserved_numbers(gateway: Ga
     assert 69_990 <= found[8] << 16 | found[9] < 80_000
 
 
-def test_the_registers_common_to_all_drives_show_no_value_read_before_a_sleep(gateway: Gateway) -> None:
+def test_common_modbus_registers_hide_values_from_before_a_computer_sleep(gateway: Gateway) -> None:
+    """Such values become unknown, however recent they look. Their age is the largest number that fits."""
     gateway.hub.values["mill", "output_frequency"] = 49.99
     gateway.hub.woken_ns = time.monotonic_ns() + 3600 * 10**9
     found = block(gateway)
@@ -581,7 +595,7 @@ def test_the_registers_common_to_all_drives_show_no_value_read_before_a_sleep(ga
 
 
 @table(("number", "expected"), [(5.0, 5), (None, 0xFFFE), (0.0, 0xFFFE), (inf, 0xFFFE), (0.5, 0xFFFE)])
-def test_the_registers_common_to_all_drives_include_the_fault_number(
+def test_common_modbus_registers_include_the_fault_number(
     gateway: Gateway, number: float | None, expected: int
 ) -> None:
     gateway.hub.states["mill"] = "fault"
@@ -589,7 +603,7 @@ def test_the_registers_common_to_all_drives_include_the_fault_number(
     assert block(gateway)[:2] == [3, expected]
 
 
-def test_a_read_is_refused_if_only_a_part_of_it_is_in_the_common_registers(gateway: Gateway) -> None:
+def test_a_read_across_the_edge_of_the_common_modbus_registers_is_refused(gateway: Gateway) -> None:
     gateway.hub.states["mill"] = "stands"
     with gateway.client() as client:
         assert client.ask(1, 3, BLOCK, 1).words == [1]
@@ -599,13 +613,13 @@ def test_a_read_is_refused_if_only_a_part_of_it_is_in_the_common_registers(gatew
         assert client.ask(1, 3, BLOCK - 1, 18).code == 2
 
 
-def test_drives_of_every_family_have_the_registers_common_to_all_drives(gateway: Gateway) -> None:
+def test_drives_of_every_family_have_the_common_modbus_registers(gateway: Gateway) -> None:
     for unit, drive in enumerate(("mill", "meter", "pump", "belt"), 1):
         gateway.hub.states[drive] = "runs"
         assert block(gateway, unit)[0] == 2
 
 
-def test_a_line_with_its_own_tcp_port_is_served_there() -> None:
+def test_a_line_can_be_served_on_a_separate_modbus_tcp_port() -> None:
     found = plant_of(("hall", InvtCHE(1, name="mill")), ("yard", Meter(1, name="meter")))
     with serving(found, ModbusSettings(listen="127.0.0.1:0", ports={"yard": 0})) as gateway:
         gateway.hub.values.update({("mill", "output_voltage"): 231.0, ("meter", "level"): 12.5})
@@ -614,7 +628,7 @@ def test_a_line_with_its_own_tcp_port_is_served_there() -> None:
             assert yard.ask(1, 3, 0, 1).words == [125]
 
 
-def test_the_server_adopts_a_new_plant_unless_its_unit_ids_clash(gateway: Gateway) -> None:
+def test_the_modbus_server_refuses_a_new_plant_if_unit_ids_clash(gateway: Gateway) -> None:
     with gateway.client() as client:
         with pytest.raises(ValueError, match="unit 1 would be"):
             gateway.server.adopt(plant_of(("hall", InvtCHE(1, name="a")), ("yard", InvtCHE(1, name="b"))))

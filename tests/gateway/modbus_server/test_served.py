@@ -78,7 +78,7 @@ def reply_to(client: RawClient, *words: int) -> RawReply:
 
 
 @pytest.mark.slow
-def test_drives_of_a_plant_file_can_be_read_written_and_stopped_by_modbus(tmp_path: Path) -> None:
+def test_modbus_clients_can_read_change_and_stop_drives_of_a_plant_file(tmp_path: Path) -> None:
     with simulated_plant(tmp_path) as (drive, path), gateway_of(path) as gateway:
         drive["output_voltage"] = 231
         server: Any = gateway.feeds["modbus"]
@@ -211,7 +211,7 @@ def test_each_exception_code_is_in_a_table_of_the_documentation() -> None:
     assert set(rows("Exceptions")) == {f"{code:02X}" for code in ModbusCode} | {"others"}
 
 
-def test_the_registers_common_to_all_drives_have_the_documented_layout() -> None:
+def test_common_modbus_registers_have_the_documented_layout() -> None:
     offsets = [int(address.rstrip("H"), 16) - ModbusSettings().common for address in rows("The common block")]
     layout = words
     assert offsets == [
@@ -224,7 +224,7 @@ def test_the_registers_common_to_all_drives_have_the_documented_layout() -> None
     assert {name: int(number) for number, name in states} == words.STATES
 
 
-def test_the_limits_of_clients_are_those_in_the_documentation() -> None:
+def test_limits_of_modbus_clients_agree_with_the_documentation() -> None:
     text = REFERENCE.partition("## Clients")[2]
     numbers = [int(number) for number in re.findall(r"\d+", text)]
     assert numbers == [
@@ -244,7 +244,7 @@ def numbers(units: Units) -> dict[tuple[str, int], str]:
     return {(port, number): unit.drive.name for port, number, unit in units}
 
 
-def test_the_default_unit_id_is_the_drives_address() -> None:
+def test_the_unit_id_of_a_drive_is_its_address_by_default() -> None:
     units = Units(
         plant_of(("hall", InnovertIBD(1, name="pump")), ("yard", InvtCHE(9, name="mill"))), ModbusSettings()
     )
@@ -273,7 +273,7 @@ def test_all_clashing_unit_ids_are_reported_with_free_unit_ids() -> None:
     assert last.endswith("free numbers: 3 to 4, 6 to 247")
 
 
-def test_a_configured_unit_id_or_port_resolves_a_clash_of_unit_ids() -> None:
+def test_a_configured_unit_id_or_port_avoids_a_clash_of_unit_ids() -> None:
     plant = plant_of(("hall", InnovertIBD(1, name="pump")), ("yard", InvtCHE(1, name="mill")))
     assert numbers(Units(plant, ModbusSettings(units={"mill": 21}))) == {
         (MAIN, 1): "pump",
@@ -308,7 +308,7 @@ def test_address_0_is_reported_as_an_invalid_unit_id() -> None:
     }
 
 
-def test_an_overlap_of_own_and_common_registers_is_reported() -> None:
+def test_a_drive_register_at_an_address_of_common_registers_is_reported() -> None:
     class Parameters(Drive):
         frequency_source = setting(0xF003)
 
@@ -318,7 +318,7 @@ def test_an_overlap_of_own_and_common_registers_is_reported() -> None:
     Units(plant, ModbusSettings(common=0xE000))
 
 
-def test_no_family_has_registers_at_the_default_addresses_of_the_common_registers() -> None:
+def test_no_drive_family_uses_the_addresses_of_the_common_registers() -> None:
     families = [find_model(name) for name in MODELS] + [load_family(path) for path in FAMILIES.glob("*.toml")]
     assert len(families) > 10
     common = set(ModbusSettings().common_addresses)
@@ -342,17 +342,17 @@ def test_no_family_has_registers_at_the_default_addresses_of_the_common_register
         ("delta-ms300", "control", 1),
     ],
 )
-def test_the_values_that_stop_each_family_are_known(model: str, register: str, raw: int) -> None:
+def test_the_stop_values_of_each_drive_family_are_known(model: str, register: str, raw: int) -> None:
     unit = Unit("hall", PolledDrive(find_model(model)(1), ()))
     assert StopWrite(register, raw) in unit.stops
 
 
-def test_a_control_value_that_means_no_command_is_not_a_stop() -> None:
+def test_the_control_value_for_no_command_is_not_a_stop() -> None:
     unit = Unit("hall", PolledDrive(InnovertIBD(1), ()))
     assert unit.stops == {StopWrite("control", 1)}  # not 0, which means "no command"
 
 
-def test_addresses_of_registers_and_texts_and_readable_gaps_count_as_declared() -> None:
+def test_declared_addresses_include_registers_texts_and_readable_gaps() -> None:
     class Meter(Drive):
         readable_gaps = {HOLDING: range(10, 20)}
         level = reading(9, "m")
@@ -421,7 +421,7 @@ def writes(tool: Any, address: int, value: int) -> bool:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", usually(*TOOLS))
-def test_a_modbus_tool_reads_the_drives_and_cannot_write_by_default(name: str, tmp_path: Path) -> None:
+def test_each_known_modbus_tool_can_only_read_by_default(name: str, tmp_path: Path) -> None:
     with connected(name, tmp_path, SERVE) as (gateway, tool):
         sim, polled = gateway.sims["pump-1"], gateway.gateway.poller.statistics()  # type: ignore[union-attr]
         assert read(tool, OUTPUT_VOLTAGE, 2) == [VOLTAGE, 0]
@@ -441,7 +441,7 @@ def test_a_modbus_tool_reads_the_drives_and_cannot_write_by_default(name: str, t
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", usually(*TOOLS))
-def test_a_tool_that_may_write_can_stop_but_not_start_a_drive(name: str, tmp_path: Path) -> None:
+def test_each_known_modbus_tool_can_stop_but_not_start_a_drive(name: str, tmp_path: Path) -> None:
     with connected(name, tmp_path, SERVE.replace("[serve.tool]", '[serve.tool]\nmay = "write"')) as (
         gateway,
         tool,

@@ -125,7 +125,7 @@ def test_a_read_by_each_modbus_function_gets_the_drives_reply(rig: Rig, tool: in
     assert rig.line.asked == [("mill", 3, 16, 2), ("mill", 4, 0x7000, 1), ("mill", 1, 1, 10)]
 
 
-def test_a_failed_read_is_answered_by_silence_or_an_exception_as_on_a_real_line(rig: Rig) -> None:
+def test_a_failed_read_of_a_modbus_tool_gets_no_reply_or_an_exception(rig: Rig) -> None:
     with opened(str(rig.link)) as tool:
         for failure, answer in (
             (DriveException("mill", 0x12, "write not allowed"), 0x12),
@@ -144,7 +144,7 @@ def test_a_failed_read_is_answered_by_silence_or_an_exception_as_on_a_real_line(
                 assert code(tool, "01 03 00 10 00 02") == answer
 
 
-def test_unknown_addresses_silent_drives_and_broadcasts_are_not_answered(rig: Rig, tool: int) -> None:
+def test_a_modbus_tool_gets_no_answer_from_unknown_or_silent_drives(rig: Rig, tool: int) -> None:
     assert is_unanswered(tool, "02 03 00 10 00 02")
     assert is_unanswered(tool, "00 06 20 00 00 00")
     rig.hub.states["mill"] = "silent"
@@ -154,14 +154,14 @@ def test_unknown_addresses_silent_drives_and_broadcasts_are_not_answered(rig: Ri
     assert rig.commands.stopped == []
 
 
-def test_a_drive_without_modbus_and_an_unknown_function_get_exception_01(rig: Rig, tool: int) -> None:
+def test_a_modbus_tool_gets_exception_01_for_unsupported_requests(rig: Rig, tool: int) -> None:
     assert code(tool, "04 03 00 10 00 02") == 1
     assert code(tool, "01 41 01 02 03") == 1
     assert code(tool, "01 08 00 04 00 00") == 1  # "force listen only mode", which would silence a drive
     assert rig.line.asked == []
 
 
-def test_a_request_that_fails_unexpectedly_is_logged_and_later_ones_are_answered(
+def test_later_requests_of_a_modbus_tool_are_answered_after_an_internal_error(
     rig: Rig, tool: int, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     serve = rig.ports.lines["hall"].serve
@@ -179,7 +179,7 @@ def test_a_request_that_fails_unexpectedly_is_logged_and_later_ones_are_answered
     assert ask(tool, "01 03 00 10 00 01") == bytes.fromhex("01 03 02 0010")
 
 
-def test_only_the_newest_of_several_pending_requests_is_answered(rig: Rig, tool: int) -> None:
+def test_only_the_newest_pending_request_of_a_modbus_tool_is_answered(rig: Rig, tool: int) -> None:
     rig.line.seconds = 0.05
     requests = [checksums.rtu(f"01 03 00 {at:02X} 00 01") for at in (1, 2, 3)]
     os.write(tool, b"".join(requests))
@@ -255,7 +255,7 @@ def test_a_modbus_tool_with_random_timeouts_gets_only_replies_to_its_last_reques
     assert answered > 20
 
 
-def test_serial_settings_of_a_modbus_tool_have_no_effect_and_echo_is_turned_off(rig: Rig) -> None:
+def test_serial_settings_made_by_a_modbus_tool_have_no_effect(rig: Rig) -> None:
     import termios
 
     with opened(str(rig.link)) as tool:
@@ -270,7 +270,7 @@ def test_serial_settings_of_a_modbus_tool_have_no_effect_and_echo_is_turned_off(
     assert len(rig.commands.written) == 1
 
 
-def test_a_port_for_modbus_tools_refuses_and_records_each_write_by_default(tmp_path: Path) -> None:
+def test_writes_of_modbus_tools_are_refused_and_recorded_by_default(tmp_path: Path) -> None:
     with serving(tmp_path) as rig, opened(str(rig.link)) as tool:
         for body in (
             f"01 06 {CONTROL:04X} {START:04X}",
@@ -287,7 +287,7 @@ def test_a_port_for_modbus_tools_refuses_and_records_each_write_by_default(tmp_p
         assert len(rig.commands.refused) < 6  # at most one record a second
 
 
-def test_a_tool_that_may_write_can_set_and_stop_but_not_start_drives(rig: Rig, tool: int) -> None:
+def test_a_modbus_tool_can_write_a_setpoint_but_not_start_a_drive(rig: Rig, tool: int) -> None:
     assert code(tool, f"01 06 {SETPOINT:04X} 1388") is None
     drive, register, value, caller = rig.commands.written[0]
     assert (drive, register, value) == ("mill", "setpoint", 50.0)
@@ -299,7 +299,7 @@ def test_a_tool_that_may_write_can_set_and_stop_but_not_start_drives(rig: Rig, t
     assert len(rig.commands.written) == 1
 
 
-def test_each_stop_is_sent_although_a_modbus_tool_sends_requests_right_after_it(rig: Rig, tool: int) -> None:
+def test_each_stop_of_a_modbus_tool_is_sent_although_reads_follow(rig: Rig, tool: int) -> None:
     stop, read = checksums.rtu(f"01 06 {CONTROL:04X} {STOP:04X}"), checksums.rtu("01 03 00 01 00 01")
     os.write(tool, stop + read + stop + read)
     assert receive(tool, 7) == checksums.rtu("01 03 02 0001")
@@ -317,12 +317,12 @@ def test_a_stop_right_after_an_incomplete_request_is_sent(rig: Rig, tool: int) -
     assert len(rig.commands.stopped) == 1
 
 
-def test_a_stop_in_a_write_of_several_registers_is_sent_and_the_rest_is_refused(rig: Rig, tool: int) -> None:
+def test_only_the_stop_in_a_write_of_several_registers_is_sent(rig: Rig, tool: int) -> None:
     assert code(tool, f"01 10 {CONTROL:04X} 0002 04 {STOP:04X} 0000") == 3
     assert len(rig.commands.stopped) == 1
 
 
-def test_a_failed_write_is_answered_with_an_exception_or_not_at_all(rig: Rig) -> None:
+def test_a_failed_write_of_a_modbus_tool_gets_an_exception_or_no_answer(rig: Rig) -> None:
     """A write is recorded as refused only if it was not sent to the drive."""
     with opened(str(rig.link)) as tool:
         for error, answer in (
@@ -347,7 +347,7 @@ def test_hostile_bytes_from_a_modbus_tool_do_not_affect_the_next_tool(rig: Rig, 
     assert {*rig.line.asked} == {("mill", 3, 16, 1)}
 
 
-def test_eight_modbus_tools_on_tcp_are_served_and_a_ninth_is_refused(rig: Rig) -> None:
+def test_a_ninth_modbus_tool_on_one_tcp_port_is_refused(rig: Rig) -> None:
     tools = [socket.create_connection(("127.0.0.1", rig.ports.ports["hall"])) for _ in range(9)]
     try:
         for tool in tools[:8]:
@@ -358,7 +358,7 @@ def test_eight_modbus_tools_on_tcp_are_served_and_a_ninth_is_refused(rig: Rig) -
             tool.close()
 
 
-def test_a_connection_is_accepted_after_a_failed_attempt(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_modbus_tool_can_connect_after_a_failed_accept(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     failures: list[None] = []
 
     def accept() -> Any:
@@ -378,7 +378,7 @@ def test_a_connection_is_accepted_after_a_failed_attempt(rig: Rig, monkeypatch: 
         assert ask(tool.fileno(), "01 03 00 10 00 01") == bytes.fromhex("01 03 02 0010")
 
 
-def test_a_symlink_is_replaced_only_if_a_killed_gateway_made_it(tmp_path: Path) -> None:
+def test_only_a_symlink_left_by_a_killed_gateway_is_replaced(tmp_path: Path) -> None:
     link = tmp_path / "port"
     link.write_text("a file")
     with pytest.raises(OSError, match="a file of this name exists, and no gateway made it"):
@@ -498,7 +498,7 @@ def cut(*pieces: bytes) -> list[bytes]:
 
 
 @table("frame", [*EVERY_FRAME, VENDORS_OWN])
-def test_a_request_is_recognised_whether_it_arrives_whole_or_byte_by_byte(frame: bytes) -> None:
+def test_a_modbus_request_is_recognised_if_it_arrives_byte_by_byte(frame: bytes) -> None:
     assert cut(frame) == [frame]
     assert cut(*(frame[at : at + 1] for at in range(len(frame)))) == [frame]
 
@@ -512,7 +512,7 @@ def test_a_request_after_noise_or_a_damaged_frame_is_recognised(noise: bytes) ->
     assert cut(noise + FRAMES[0]) == [FRAMES[0]]
 
 
-def test_a_request_after_an_incomplete_frame_is_recognised_after_silence() -> None:
+def test_a_request_behind_an_incomplete_frame_is_found_after_silence() -> None:
     """The request may be a stop. The incomplete frame may come from a tool that was closed."""
     cutter = RequestCutter()
     cutter.add(bytes.fromhex("01 10 00 00 00 7B F6") + FRAMES[6])
@@ -534,7 +534,7 @@ def test_an_incomplete_request_is_dropped_after_silence() -> None:
     assert taken(cutter) == [FRAMES[0]]
 
 
-def test_random_bytes_are_no_request_and_few_of_them_are_kept() -> None:
+def test_random_bytes_are_not_recognised_as_a_modbus_request() -> None:
     """By chance, one position in 65,536 has a valid checksum; the bytes of this seed have none."""
     chance, cutter = random.Random(43), RequestCutter()
     for _ in range(400):

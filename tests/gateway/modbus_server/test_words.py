@@ -82,7 +82,7 @@ def sent(draw: st.DrawFn) -> tuple[NumberFormat, str, float, float, bytes]:
 # the sum of 1e-20 and the offset equals the offset, so that the raw value cannot be computed
 @example((NumberFormat.F64, "ABCD", 1, 1000, struct.pack(">d", 1e-20)))
 @example((NumberFormat.F32, "ABCD", 1, 273.15, struct.pack(">f", 1e-20)))
-def test_register_words_computed_from_a_value_are_right_or_unknown(
+def test_words_computed_from_a_value_equal_the_drives_words_or_none(
     case: tuple[NumberFormat, str, float, float, bytes],
 ) -> None:
     number_format, order, step, offset, data = case
@@ -145,7 +145,7 @@ def test_no_register_words_are_computed_for_a_format_with_undefined_bits(details
     assert exact_data(declared(**details), 5.0) is None
 
 
-def test_the_words_of_a_register_scaled_by_another_one_are_not_computed() -> None:
+def test_no_register_words_are_computed_if_another_register_sets_the_scale() -> None:
     family = type(
         "Scaled",
         (Drive,),
@@ -221,7 +221,7 @@ def test_a_range_of_addresses_is_answered_with_the_drives_words() -> None:
     assert read(2, 8, 1) == [0]
 
 
-def test_a_range_of_addresses_with_one_unknown_word_is_not_answered() -> None:
+def test_an_address_range_is_not_answered_if_one_word_is_unknown() -> None:
     # this range contains a register that has only some bits of its word
     assert read(3, 3, 2) is Unavailable.UNPOLLED
     assert read(3, 9, 1) is Unavailable.UNPOLLED
@@ -230,7 +230,7 @@ def test_a_range_of_addresses_with_one_unknown_word_is_not_answered() -> None:
     assert read(3, 5, 2, level=FakeRow(NOW, 0.0)) is Unavailable.UNPOLLED  # 0.0, whose sign is unknown
 
 
-def test_a_range_with_an_old_value_or_a_failed_read_is_not_answered() -> None:
+def test_an_address_range_is_not_answered_if_one_value_is_old() -> None:
     assert read(3, 0, 4, status=FakeRow(NOW, None)) is Unavailable.STALE
     assert read(3, 0, 4, status=FakeRow(NOW - S, 3.0)) == [1450, 2, 1, 3]
     assert read(3, 0, 4, status=FakeRow(NOW - S - 1, 3.0)) is Unavailable.STALE
@@ -297,7 +297,7 @@ frames = st.builds(
 
 
 @given(st.lists(frames, max_size=6), st.lists(st.integers(1, 40), min_size=1, max_size=40))
-def test_requests_are_parsed_equally_however_their_bytes_arrive(sent: list[bytes], cuts: list[int]) -> None:
+def test_modbus_requests_are_parsed_from_pieces_of_any_size(sent: list[bytes], cuts: list[int]) -> None:
     whole = b"".join(sent)
     buffer, found, at = bytearray(), [], 0
     while at < len(whole):

@@ -66,7 +66,7 @@ def said(topic: str, text: bytes = b"") -> Publication:
     return Publication(topic, lambda: text)
 
 
-def test_the_outbox_limits_unacknowledged_messages_and_then_sends_only_the_newest() -> None:
+def test_only_the_newest_message_of_a_topic_waits_for_acknowledgements() -> None:
     wire = BreakableConnection()
     outbox = Outbox(wire.send)
     for round in range(100):
@@ -84,7 +84,7 @@ def test_the_outbox_limits_unacknowledged_messages_and_then_sends_only_the_newes
     assert outbox.is_idle
 
 
-def test_the_payload_of_a_pending_message_is_made_when_it_is_sent() -> None:
+def test_the_payload_of_an_mqtt_message_is_made_just_before_sending() -> None:
     wire, now = BreakableConnection(), [b"old"]
     outbox = Outbox(wire.send)
     wire.is_open = False
@@ -94,7 +94,7 @@ def test_the_payload_of_a_pending_message_is_made_when_it_is_sent() -> None:
     assert wire.sent == [("state", b"new")]
 
 
-def test_a_message_whose_payload_cannot_be_made_is_dropped_and_the_next_is_sent() -> None:
+def test_the_next_message_is_sent_if_a_payload_cannot_be_made() -> None:
     wire = BreakableConnection()
     outbox = Outbox(wire.send)
     outbox.put(Publication("told", "\ud800".encode))
@@ -116,7 +116,7 @@ def test_a_lost_connection_drops_and_counts_pending_messages() -> None:
     assert wire.sent[-1] == ("next", b"")
 
 
-def test_acknowledged_messages_make_room_in_the_outbox_immediately() -> None:
+def test_waiting_messages_are_sent_as_soon_as_others_are_acknowledged() -> None:
     wire = BreakableConnection()
     outbox = Outbox(wire.send)
     for topic in range(3 * MOST_UNDER_WAY):
@@ -128,7 +128,7 @@ def test_acknowledged_messages_make_room_in_the_outbox_immediately() -> None:
     assert len(wire.sent) == 2 * MOST_UNDER_WAY
 
 
-def test_pending_messages_beyond_the_limit_are_dropped_and_counted() -> None:
+def test_waiting_mqtt_messages_beyond_a_limit_are_dropped_and_counted() -> None:
     """Commands can choose a new topic for each answer, so a broker could otherwise fill the memory."""
     wire = BreakableConnection()
     outbox = Outbox(wire.send)
@@ -191,7 +191,7 @@ def test_a_burst_of_acknowledgements_wakes_the_event_loop_once(monkeypatch: pyte
     assert told[20:] == [20]
 
 
-def test_the_number_of_received_messages_that_wait_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_number_of_unprocessed_received_messages_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
     require_module("paho.mqtt.client")
     broker, loop, handled = (
         Broker(parse_broker("mqtt://localhost"), Login(), "a", Silent()),
@@ -371,7 +371,7 @@ class HeldCommands:
         return {"pump-1": CommandResult(CommandOutcome.DONE, "stopped")}
 
 
-async def test_the_limit_of_concurrent_broker_commands_lets_stops_pass() -> None:
+async def test_a_stop_is_sent_when_too_many_broker_commands_are_in_progress() -> None:
     told: list[tuple[str, str]] = []
     commands: Any = HeldCommands()
     orders = BrokerCommands(
@@ -425,7 +425,9 @@ def now_ms() -> int:
 
 @pytest.mark.slow
 @on_nats
-def test_nats_reports_a_lost_gateway(broker: RunningBroker, listener: Listener, start: Start) -> None:
+def test_a_nats_server_publishes_offline_if_the_gateway_is_lost(
+    broker: RunningBroker, listener: Listener, start: Start
+) -> None:
     _, running = start()
     listener.wait_for(has("multidrop/gateway", b"online"))
     listener.wait_for(has(f"multidrop/{PLAIN_FAN.name}/available", b"online"))
@@ -478,7 +480,7 @@ def test_a_retained_command_is_refused(broker: RunningBroker, listener: Listener
 
 @pytest.mark.slow
 @nats_of(old_server_program)
-def test_a_broker_that_rejects_sparkplug_topics_does_not_delay_json_topics(
+def test_json_topics_are_published_although_the_broker_rejects_sparkplug(
     broker: RunningBroker, listener: Listener, start: Start
 ) -> None:
     """Sparkplug's topics contain a dot, for which nats-server before 2.10 closes the connection."""
@@ -498,7 +500,9 @@ def test_a_broker_that_rejects_sparkplug_topics_does_not_delay_json_topics(
 
 @pytest.mark.slow
 @on_nats
-def test_a_sparkplug_host_on_nats_can_send_commands(broker: RunningBroker, host: Host, start: Start) -> None:
+def test_a_sparkplug_host_can_send_commands_through_nats(
+    broker: RunningBroker, host: Host, start: Start
+) -> None:
     known, running = start(sparkplug="works", node="line", commands=True)
     assert host.values(host.wait_for("NBIRTH")) == {"bdSeq": 0, "Node Control/Rebirth": False}
     born = host.values(host.wait_for("DBIRTH", "pump-1"))

@@ -59,7 +59,7 @@ def now_on_both_clocks() -> tuple[int, int]:
             return utc_ms, boot_ns
 
 
-def test_the_newest_values_are_retained(broker: Broker, listener: Listener, start: Start) -> None:
+def test_the_mqtt_broker_retains_the_newest_values(broker: Broker, listener: Listener, start: Start) -> None:
     start()
     listener.wait_for(has("multidrop/gateway", b"online"))
     listener.wait_for(has(f"multidrop/{FAN.name}/available", b"online"))
@@ -74,7 +74,9 @@ def test_the_newest_values_are_retained(broker: Broker, listener: Listener, star
     }
 
 
-def test_stale_values_are_null_and_silent_drives_are_offline(listener: Listener, start: Start) -> None:
+def test_mqtt_shows_stale_values_as_null_and_silent_drives_as_offline(
+    listener: Listener, start: Start
+) -> None:
     known, running = start()
     listener.wait_for(has("multidrop/pump-1/available", b"online"))
     known.hub.values[("pump-1", "output_frequency")] = None
@@ -85,7 +87,9 @@ def test_stale_values_are_null_and_silent_drives_are_offline(listener: Listener,
     assert json_of(said)["values"]["output_frequency"] is None
 
 
-def test_the_message_offline_is_retained(broker: Broker, listener: Listener, start: Start) -> None:
+def test_the_broker_retains_the_message_offline_after_a_lost_connection(
+    broker: Broker, listener: Listener, start: Start
+) -> None:
     _, running = start()
     listener.wait_for(has("multidrop/gateway", b"online"))
     running._part._brokers[0]._client.reconnect_delay_set(3600, 3600)
@@ -122,7 +126,9 @@ def test_closing_the_gateway_publishes_offline(broker: Broker, listener: Listene
         listener.wait_for(has(f"multidrop/{drive}/available", b"offline"))
 
 
-def test_failing_publications_do_not_prevent_stops(broker: Broker, listener: Listener, start: Start) -> None:
+def test_a_stop_is_carried_out_while_publishing_fails(
+    broker: Broker, listener: Listener, start: Start
+) -> None:
     """Without "offline", the values that the broker retains would look current."""
     known, running = start(commands=True)
     listener.wait_for(has("multidrop/gateway", b"online"))
@@ -144,7 +150,9 @@ def test_failing_publications_do_not_prevent_stops(broker: Broker, listener: Lis
 
 
 @pytest.mark.slow
-def test_a_failing_publisher_is_offline_after_a_reconnection_too(listener: Listener, start: Start) -> None:
+def test_offline_is_published_if_publishing_fails_after_a_reconnection(
+    listener: Listener, start: Start
+) -> None:
     known, running = start()
     listener.wait_for(has("multidrop/gateway", b"online"))
     state = known.hub.states.pop("pump-1")
@@ -180,7 +188,9 @@ def test_publishing_never_waits_for_a_frozen_broker(broker: Broker, listener: Li
 
 
 @pytest.mark.slow
-def test_a_restarted_broker_gets_all_messages(broker: Broker, listener: Listener, start: Start) -> None:
+def test_messages_are_published_again_after_the_broker_restarts(
+    broker: Broker, listener: Listener, start: Start
+) -> None:
     start()
     listener.wait_for(has("multidrop/gateway", b"online"))
     broker.kill()
@@ -206,7 +216,9 @@ def write_of(value: object, time_ms: int, **more: object) -> bytes:
     return json.dumps({"value": value, "time": time_ms, **more}).encode()
 
 
-def test_a_recent_write_is_carried_out_once(broker: Broker, listener: Listener, commanded: Any) -> None:
+def test_a_repeated_mqtt_write_is_carried_out_once(
+    broker: Broker, listener: Listener, commanded: Any
+) -> None:
     fresh = write_of(25, now_ms(), id="order-7")
     publish(broker, "multidrop/pump-1/set/setpoint", fresh)
     assert told(listener) == {"what": "setpoint = 25", "done": True, "text": "done", "id": "order-7"}
@@ -216,7 +228,9 @@ def test_a_recent_write_is_carried_out_once(broker: Broker, listener: Listener, 
 
 
 @pytest.mark.parametrize("age_ms", [60_000, -60_000])
-def test_a_late_command_is_refused(broker: Broker, listener: Listener, commanded: Any, age_ms: int) -> None:
+def test_an_mqtt_command_is_refused_if_its_time_is_wrong_by_a_minute(
+    broker: Broker, listener: Listener, commanded: Any, age_ms: int
+) -> None:
     sent_ms = now_ms() - age_ms
     publish(broker, "multidrop/pump-1/set/setpoint", write_of(25, sent_ms))
     assert "s ago by the clocks of sender and gateway" in told(listener)["text"]
@@ -236,7 +250,7 @@ def test_a_retained_command_is_refused(broker: Broker, listener: Listener, start
 
 
 @pytest.mark.slow
-def test_a_retained_stop_for_all_is_carried_out(broker: Broker, listener: Listener, start: Start) -> None:
+def test_a_stop_is_carried_out_on_each_stop_topic(broker: Broker, listener: Listener, start: Start) -> None:
     publish(broker, "multidrop/pump-1/stop", b"stop", "-r")
     known, _ = start(commands=True)
     assert told(listener)["what"] == "stop"
@@ -337,13 +351,17 @@ async def test_a_stop_verb_finds_drives_by_another_unicode_spelling(
     assert known.commands.noted == [("act", drive, "coast", {}) for drive in stopped]
 
 
-def test_a_verb_that_is_not_a_text_is_refused(broker: Broker, listener: Listener, commanded: Any) -> None:
+def test_a_command_is_refused_if_its_verb_is_not_a_text(
+    broker: Broker, listener: Listener, commanded: Any
+) -> None:
     publish(broker, "multidrop/pump-1/act", b'{"verb": ["coast"], "drive": "pump-1", "time": 1}')
     assert not told(listener)["done"]
     assert commanded.commands.noted == []
 
 
-def test_a_command_before_a_reload_is_refused(broker: Broker, listener: Listener, commanded: Any) -> None:
+def test_an_mqtt_command_sent_before_a_reload_is_refused(
+    broker: Broker, listener: Listener, commanded: Any
+) -> None:
     """After a reload, the drive's name may mean another drive."""
     for after_ms, text in (
         (1900, "not sent: the command may have been sent before the plant"),
@@ -376,7 +394,9 @@ def test_a_command_sent_before_a_stop_is_refused(
     assert len(commanded.commands.noted) == (3 if is_taken else 1)
 
 
-def test_a_payload_for_another_drive_is_refused(broker: Broker, listener: Listener, commanded: Any) -> None:
+def test_a_command_is_refused_if_its_payload_names_another_drive(
+    broker: Broker, listener: Listener, commanded: Any
+) -> None:
     act = {"verb": "start", "drive": "pump-1", "options": {"direction": "forward"}, "time": now_ms()}
     publish(broker, f"multidrop/{FAN.name}/act", json.dumps(act).encode())
     assert "the message names drive 'pump-1'" in told(listener, FAN.name)["text"]
@@ -408,7 +428,7 @@ def test_invalid_commands_are_answered_with_the_reason(
 
 
 @pytest.mark.parametrize(("drive", "verb"), [("pump-1", "\ud800"), ("x" * 65_521, "")])
-def test_an_answer_that_cannot_be_sent_does_not_affect_other_messages(
+def test_other_messages_are_sent_if_one_answer_cannot_be_sent(
     broker: Broker, listener: Listener, start: Start, drive: str, verb: str
 ) -> None:
     """One answer has a verb that is not UTF-8; the other has a topic of 65,536 bytes, too long for MQTT."""
@@ -436,7 +456,7 @@ def test_an_infinite_value_is_published_as_null(listener: Listener, start: Start
     assert b'"output_frequency": null' in said.payload
 
 
-def test_the_gateway_subscribes_to_no_drive_commands_unless_they_are_enabled(tmp_path: Path) -> None:
+def test_no_command_topic_is_subscribed_if_commands_are_disabled(tmp_path: Path) -> None:
     require_module("paho.mqtt.client")
     part: Any = build(MqttSettings(sparkplug="works", node="line"), inside(tmp_path))
     assert [messages.topics() for messages in part._formats] == [
@@ -447,7 +467,7 @@ def test_the_gateway_subscribes_to_no_drive_commands_unless_they_are_enabled(tmp
 
 
 @pytest.mark.parametrize("is_retained", [False, True])
-async def test_commands_are_ignored_unless_enabled(tmp_path: Path, is_retained: bool) -> None:
+async def test_mqtt_commands_are_ignored_if_commands_are_disabled(tmp_path: Path, is_retained: bool) -> None:
     """A broker may send messages of topics to which the gateway has not subscribed."""
     require_module("paho.mqtt.client")
     known = inside(tmp_path)
@@ -532,7 +552,7 @@ class Meter(Drive):
     generated = reading(0x0006, "MWh", number_format=NumberFormat.U32)
 
 
-def test_only_an_energy_that_cannot_fall_is_declared_as_increasing() -> None:
+def test_an_energy_register_is_declared_increasing_only_if_it_cannot_fall() -> None:
     names = ["net_energy", "total_energy", "float_energy", "generated"]
     meter = Meter(1)
     parts = configured(meter, names, [])["cmps"]
@@ -541,7 +561,7 @@ def test_only_an_energy_that_cannot_fall_is_declared_as_increasing() -> None:
     assert {parts[name]["device_class"] for name in names} == {"energy"}
 
 
-def test_the_computed_energy_of_a_channel_may_fall() -> None:
+def test_the_computed_energy_of_a_channel_is_not_declared_increasing() -> None:
     topics = {name: name for name in ("state", "gateway", "available", "set", "stop")}
     details: Any = {"prefix": "works", "version": "1", "every_s": 1.0, "takes_commands": True}
     energy = Channel("energy", "integral(output_power)", "kWh").register
@@ -720,7 +740,7 @@ def test_a_plant_file_name_that_sparkplug_forbids_is_reported(tmp_path: Path) ->
     assert sentence == "the plant file's name 'a+b' cannot be an edge node; add node = \"hall-1\""
 
 
-def test_words_of_mqtt_topics_are_reserved_as_drive_names(tmp_path: Path) -> None:
+def test_words_of_mqtt_topics_are_not_allowed_as_drive_names(tmp_path: Path) -> None:
     topics = JsonTopics(MqttSettings(commands=True), inside(tmp_path), now_ms)
     topics.outbox = PutMessages()
     topics.connected()
@@ -776,7 +796,7 @@ class PutMessages:
         return {one.topic for one in self.put_in if one.is_retained and one.make() == b""}
 
 
-def test_topics_of_a_drive_removed_without_a_connection_are_deleted_later(tmp_path: Path) -> None:
+def test_topics_of_removed_drives_are_deleted_on_the_next_connection(tmp_path: Path) -> None:
     """A broken connection drops pending deletions, so they must be repeated on the next connection."""
     known = inside(tmp_path)
     whole = known.plant
@@ -797,7 +817,7 @@ def test_topics_of_a_drive_removed_without_a_connection_are_deleted_later(tmp_pa
 
 
 @pytest.mark.parametrize("is_known", [True, False])
-def test_no_topic_is_deleted_before_a_fleet_knows_its_lines(tmp_path: Path, is_known: bool) -> None:
+def test_no_topic_is_deleted_while_the_plant_has_no_lines(tmp_path: Path, is_known: bool) -> None:
     known = inside(tmp_path)
     plant = known.plant if is_known else replace(known.plant, lines=())
     topics = JsonTopics(MqttSettings(), known._replace(plant=plant), now_ms)

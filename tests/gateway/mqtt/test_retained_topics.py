@@ -100,7 +100,7 @@ def test_topics_of_other_gateways_and_unknown_topics_are_kept(topic: str, payloa
     assert heard(GATEWAY, (topic, payload)) == []
 
 
-def test_the_number_of_retained_messages_that_are_examined_is_limited() -> None:
+def test_the_number_of_examined_retained_messages_is_limited() -> None:
     drives = [(f"works/{number}/available", b"online") for number in range(10 * MOST_KEPT)]
     assert len(heard(GATEWAY, *drives)) == 2 * MOST_KEPT
     left_behind = RetainedTopics("works", home_assistant=True)
@@ -166,7 +166,7 @@ commands = true
 
 
 @pytest.mark.long
-def test_a_start_that_a_broker_delivers_after_a_stop_is_refused(tmp_path: Path) -> None:
+def test_a_delayed_start_from_the_broker_is_refused_after_a_stop(tmp_path: Path) -> None:
     require_module("paho.mqtt.client")
     with mosquitto(tmp_path) as broker, served(tmp_path, SERVE.format(broker.address)) as gateway:
         listener = Listener(broker, "multidrop/#")

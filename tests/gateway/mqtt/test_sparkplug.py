@@ -47,7 +47,9 @@ def node(broker: Broker, host: Host, tmp_path: Path) -> Iterator[tuple[Any, Runn
     running.close()
 
 
-def test_a_node_publishes_certificates_and_data_of_its_drives(host: Host, node: tuple[Any, Running]) -> None:
+def test_a_sparkplug_node_publishes_birth_certificates_and_data(
+    host: Host, node: tuple[Any, Running]
+) -> None:
     known, running = node
     birth = host.values(host.wait_for("NBIRTH"))
     assert birth == {"bdSeq": 0, "Node Control/Rebirth": False}
@@ -73,7 +75,7 @@ def test_a_node_publishes_certificates_and_data_of_its_drives(host: Host, node: 
     assert (born["state"], born["fault"]) == ("fault", "перегрев")
 
 
-def test_the_text_of_a_fault_is_published_without_a_polled_fault_register(tmp_path: Path) -> None:
+def test_the_fault_text_is_published_if_the_fault_register_is_not_polled(tmp_path: Path) -> None:
     """The register `fault` of this drive is not polled, and its values have no names."""
     known = inside(tmp_path, VfdEl(2, name="mill"))
     known.hub.states["mill"], known.hub.faults["mill"] = "fault", "it shows a fault"
@@ -151,7 +153,7 @@ def test_a_rebirth_command_repeats_all_birth_certificates(
 
 
 @pytest.mark.slow
-def test_a_new_connection_has_the_next_bdseq(host: Host, node: tuple[Any, Running]) -> None:
+def test_each_sparkplug_connection_has_the_next_bdseq_number(host: Host, node: tuple[Any, Running]) -> None:
     host.wait_for("DBIRTH", FAN.name)
     node[1].cut(1)
     assert host.values(host.wait_for("NDEATH")) == {"bdSeq": 0}
@@ -200,7 +202,9 @@ def test_closing_the_gateway_sends_a_death_certificate(broker: Broker, host: Hos
     assert host.values(host.wait_for("NDEATH")) == {"bdSeq": 0}
 
 
-def test_recent_writes_and_any_stop_are_sent(broker: Broker, host: Host, node: tuple[Any, Running]) -> None:
+def test_an_old_sparkplug_write_is_not_sent_but_an_old_stop_is(
+    broker: Broker, host: Host, node: tuple[Any, Running]
+) -> None:
     known, _ = node
     host.wait_for("DBIRTH", "pump-1")
     alias = {name: number for number, name in host.aliases.items()}["setpoint"]
@@ -235,7 +239,9 @@ async def test_a_stop_in_an_invalid_payload_is_carried_out(
 
 
 @pytest.mark.parametrize("is_retained", [False, True])
-async def test_a_retained_message_can_stop_but_not_write(tmp_path: Path, *, is_retained: bool) -> None:
+async def test_a_retained_sparkplug_message_can_stop_but_not_write(
+    tmp_path: Path, *, is_retained: bool
+) -> None:
     """A broker sends a retained write at each connection, so even a recent one is refused."""
     known = inside(tmp_path)
     node = SparkplugNode(MqttSettings(sparkplug="works", node="line", commands=True), known, lambda: 1_000)
@@ -332,7 +338,7 @@ def test_a_command_of_a_sparkplug_host_is_decoded(field: str, value: object) -> 
 
 
 @given(st.binary(max_size=300))
-def test_any_bytes_are_decoded_or_refused_as_a_command(data: bytes) -> None:
+def test_decoding_random_bytes_raises_only_value_error(data: bytes) -> None:
     try:
         time_ms, found = read_command(data)
     except ValueError:
@@ -346,7 +352,7 @@ def test_a_damaged_command_is_decoded_or_raises_value_error(data: st.DataObject)
     whole = bytearray(payload(5, [Metric(DataType.DOUBLE, 2.5, 5, "setpoint", 3)], 1))
     whole[data.draw(st.integers(0, len(whole) - 1))] = data.draw(st.integers(0, 255))
     del whole[data.draw(st.integers(0, len(whole))) :]
-    decoded = test_any_bytes_are_decoded_or_refused_as_a_command
+    decoded = test_decoding_random_bytes_raises_only_value_error
     decoded.hypothesis.inner_test(bytes(whole))  # type: ignore[attr-defined]
 
 
@@ -391,7 +397,7 @@ def history(host: Host, kind: str, drive: str) -> list[tuple[str, int, Any]]:
     ]
 
 
-def test_a_failed_start_of_the_mqtt_part_leaves_no_spool_open(tmp_path: Path) -> None:
+def test_no_file_stays_open_if_mqtt_cannot_start(tmp_path: Path) -> None:
     settings = MqttSettings("mqtt://127.0.0.1:9", sparkplug="works", node="line", rows=True)
     other = tmp_path / settings.spool / "sparkplug" / "rows.csv"
     other.parent.mkdir(parents=True)

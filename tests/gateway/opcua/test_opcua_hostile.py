@@ -145,14 +145,16 @@ def test_the_opc_ua_server_survives_replayed_messages_with_changed_bytes(gateway
     assert gateway.get("/health").json["parts"]["opcua"] == "ok"
 
 
-def test_a_client_that_sends_a_message_without_end_is_disconnected(gateway: Served) -> None:
+def test_an_opc_ua_client_is_disconnected_if_its_message_is_too_long(gateway: Served) -> None:
     with closing(connected(gateway)) as peer:
         peer.sendall(b"HELF" + struct.pack("<I", 0xFFFF_FFFF))
         with pytest.raises(ConnectionError):
             peer.sendall(bytes(1 << 26))
 
 
-def test_a_client_that_reads_nothing_is_refused(gateway: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_opc_ua_client_is_disconnected_if_it_reads_no_answers(
+    gateway: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(server, "MOST_UNREAD", 1 << 16)
     with recorded(port_of(gateway)) as (url, sent), Client(url, timeout=PATIENCE) as client:
         client.read_values([client.get_node("ns=2;s=pump-1.State")] * 500)
@@ -180,7 +182,7 @@ def test_a_client_that_reads_nothing_is_refused(gateway: Served, monkeypatch: py
 
 
 @pytest.mark.parametrize("interval", [0.0, -1.0, 1e-9, 1e300, float("nan")])
-def test_the_interval_of_a_subscription_is_kept_within_limits(gateway: Served, interval: float) -> None:
+def test_the_interval_of_an_opc_ua_subscription_is_limited(gateway: Served, interval: float) -> None:
     with Client(f"opc.tcp://127.0.0.1:{port_of(gateway)}/", timeout=PATIENCE) as client:
         parameters = ua.CreateSubscriptionParameters(RequestedPublishingInterval=interval)
         found = client.tloop.post(client.aio_obj.uaclient.create_subscription(parameters, callback=None))
@@ -200,7 +202,7 @@ async def subscribe_and_vanish(url: str, timeout_ms: float) -> None:
 
 
 @pytest.mark.long
-def test_subscriptions_of_a_vanished_client_end_with_its_session(gateway: Served) -> None:
+def test_subscriptions_end_when_the_session_of_a_vanished_client_ends(gateway: Served) -> None:
     part: Any = gateway.gateway.feeds["opcua"]
     there = part._opened[2]._session.subscription_service.subscriptions
     before = set(there)
@@ -233,7 +235,9 @@ def make_certificate(folder: Path, name: str) -> None:
     )
 
 
-def test_with_a_certificate_sessions_are_encrypted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_opc_ua_sessions_are_encrypted_if_a_certificate_is_configured(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for name in ("plant", "client"):
         make_certificate(tmp_path, name)
     files = 'certificate = "plant.pem"\nkey = "plant-key.pem"\n'

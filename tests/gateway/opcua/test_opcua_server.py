@@ -106,7 +106,9 @@ def stop(client: Any, drive: str = "") -> str:
 
 
 @pytest.mark.slow
-async def test_a_server_closed_while_starting_accepts_no_client(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_an_opc_ua_server_accepts_no_client_if_closed_while_starting(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """A reload waits at most 3 s for the old server to end, so that server may still be starting."""
     from multidrop.gateway.opcua.server import PlantServer
 
@@ -134,7 +136,9 @@ async def test_a_server_closed_while_starting_accepts_no_client(monkeypatch: pyt
 
 
 @pytest.mark.slow
-async def test_closing_the_last_server_resets_python_settings(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_closing_the_last_opc_ua_server_restores_thread_and_gc_settings(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """The nodes are freed without a garbage collection."""
     serving, switch_s = {object()}, sys.getswitchinterval()
     monkeypatch.setattr("multidrop.gateway.opcua.part._unended", serving)
@@ -231,7 +235,9 @@ def test_opc_ua_clients_cannot_write_values(client: Any) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("drive", "drives"), [("pump-1", ["pump-1"]), ("", ["pump-1", "pump-2"])])
-def test_the_stop_method_stops_motors(gateway: Served, client: Any, drive: str, drives: list[str]) -> None:
+def test_the_opc_ua_stop_method_stops_motors(
+    gateway: Served, client: Any, drive: str, drives: list[str]
+) -> None:
     gateway.start(*drives)
     assert "stop" in stop(client, drive)
     until(lambda: all(gateway.stands(one) for one in drives))
@@ -239,7 +245,7 @@ def test_the_stop_method_stops_motors(gateway: Served, client: Any, drive: str, 
 
 
 @pytest.mark.slow
-def test_a_stop_method_called_on_the_wrong_object_still_stops_its_drive(
+def test_an_opc_ua_stop_called_on_a_wrong_object_stops_its_own_drive(
     gateway: Served, client: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     gateway.start("pump-1", "pump-2")
@@ -309,7 +315,7 @@ def test_a_stop_of_all_drives_is_sent_while_many_earlier_stops_wait(tmp_path: Pa
 
 
 @pytest.mark.slow
-def test_an_opc_ua_client_that_reads_nothing_delays_no_poll_and_no_stop(gateway: Served, client: Any) -> None:
+def test_a_hanging_opc_ua_client_delays_neither_polling_nor_stops(gateway: Served, client: Any) -> None:
     words = [sys.executable, str(SUBSCRIBER), url_of(gateway), "50"]
     gateway.start("pump-1", "pump-2")
     with BoundProcess(words, stdout=subprocess.PIPE, text=True) as subscriber:
@@ -346,7 +352,7 @@ def test_opc_ua_clients_have_the_rights_of_their_tokens(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_client_with_a_wrong_token_can_stop_drives_but_not_read_them(gateway: Served) -> None:
+def test_an_opc_ua_client_with_a_wrong_token_can_stop_but_not_read(gateway: Served) -> None:
     """The setting stop = "anyone" applies to this client as to clients without a token."""
     client = Client(url_of(gateway), timeout=PATIENCE)
     client.set_user("anna")
@@ -392,7 +398,9 @@ class Cyclic:
 
 
 @pytest.mark.long
-async def test_memory_of_removed_drives_is_freed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_memory_of_opc_ua_nodes_is_freed_when_drives_are_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     async def remove(nodes: PlantNodes, name: str) -> None:
         del nodes._drives[name]
 
@@ -501,7 +509,7 @@ def test_each_row_has_the_expected_opc_ua_status_code(
         (hub.Shown(hub.SILENT, "no reply"), ("Bad_NoCommunication", None)),
     ],
 )
-def test_an_empty_fault_text_has_status_good_only_if_polled_values_prove_it(
+def test_the_opc_ua_fault_text_is_bad_if_the_fault_state_is_unknown(
     shown: hub.Shown, expected: tuple[str, str | None]
 ) -> None:
     code, text = fault_of(shown)

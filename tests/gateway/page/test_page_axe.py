@@ -25,7 +25,9 @@ LOOKS = [("desk", "light"), ("tablet", "light"), ("phone", "dark")]
 
 
 @pytest.mark.parametrize(("size", "theme"), LOOKS)
-def test_axe_accepts_each_view(opened: Opener, gateway: FakeGateway, axe: str, size: str, theme: str) -> None:
+def test_axe_core_finds_no_accessibility_violation_in_any_view(
+    opened: Opener, gateway: FakeGateway, axe: str, size: str, theme: str
+) -> None:
     gateway.reloaded |= {"done": False, "mistakes": ["plant.toml: a mistake"] * 40}
     page = opened(size=size, color_scheme=theme)
     page.evaluate(axe)

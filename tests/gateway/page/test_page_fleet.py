@@ -22,7 +22,7 @@ def await_note(page: Any, text: str) -> None:
     until(page, f"document.querySelector('#fleet-age').textContent.includes({text!r})")
 
 
-def test_the_fleet_view_shows_gateways_and_lines_and_changes_of_masters(opened: Opener) -> None:
+def test_the_fleet_view_shows_which_gateway_polls_each_line(opened: Opener) -> None:
     page = opened("#/fleet")
     await_note(page, "Updated once a second")
     first, second, third = cells(page, "gateways")
@@ -146,7 +146,9 @@ def test_the_stop_all_button_in_the_fleet_view_stops_only_the_plant(
     until(page, "document.querySelector('#stopall').textContent === 'Stop all'")
 
 
-def test_the_stop_all_button_stops_the_fleet_if_the_gateway_may(opened: Opener, gateway: FakeGateway) -> None:
+def test_the_stop_all_button_stops_the_fleet_if_the_settings_allow_it(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     gateway.plant_changes = {"fleet_stop": True}
     gateway.fleet_outcomes = {"hall-9.pump": {"done": True, "text": "stopped"}}
     page = opened("#/fleet")

@@ -101,7 +101,9 @@ def sent_by_form(page: Any, gateway: str) -> int:
     return int(answer.value.status)
 
 
-def test_only_the_gateways_page_can_read_or_command(strange: Any, elsewhere: int, tmp_path: Path) -> None:
+def test_web_pages_of_other_sites_cannot_read_or_send_commands(
+    strange: Any, elsewhere: int, tmp_path: Path
+) -> None:
     with served(tmp_path, MAY) as gateway:
         gateway.await_state("pump-1", "stands")
         port = gateway.gateway.port
@@ -159,7 +161,7 @@ def elements(page: Any) -> list[int]:
 
 
 @pytest.mark.usefixtures("hostile")
-def test_hostile_names_of_drives_are_shown_as_text_and_break_no_layout(opened: Opener) -> None:
+def test_html_in_drive_names_is_shown_as_text(opened: Opener) -> None:
     page = opened()
     shown = page.locator("td.name").all_text_contents()
     assert set(HOSTILE.values()) <= set(shown)

@@ -53,7 +53,7 @@ def test_a_killed_gateway_is_reported(opened: Opener, gateway: FakeGateway) -> N
     assert page.locator("#said").inner_text() == "Values are old: no new values arrive."
 
 
-def test_values_of_a_hanging_gateway_become_old(opened: Opener, gateway: FakeGateway) -> None:
+def test_values_are_marked_as_old_if_the_gateway_hangs(opened: Opener, gateway: FakeGateway) -> None:
     page = opened()
     gateway.is_silent = True
     until(page, STALE)
@@ -78,7 +78,9 @@ def test_old_values_stay_old_when_the_clock_of_the_browser_is_set_back(
     until_met(page, lambda: float(age.inner_text().removesuffix(" s")) >= 2)
 
 
-def test_the_page_is_live_again_after_a_restart(opened: Opener, gateway: FakeGateway) -> None:
+def test_the_page_shows_live_values_again_after_a_gateway_restart(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     page = opened()
     gateway.kill()
     until(page, "document.body.classList.contains('dead')")
@@ -139,7 +141,7 @@ def test_values_stay_old_when_the_gateways_clock_is_set_back(opened: Opener) -> 
     assert not is_old
 
 
-def test_the_gateway_states_how_long_the_page_shows_a_value_as_current(
+def test_the_page_shows_values_as_current_for_the_time_the_gateway_states(
     opened: Opener, gateway: FakeGateway, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Here the gateway reports that values stay current for ten minutes."""
@@ -152,7 +154,7 @@ def test_the_gateway_states_how_long_the_page_shows_a_value_as_current(
     assert page.locator("tr.drive", has_text="pump-2").locator(".value.old").count() == 0
 
 
-def test_problems_of_the_gateway_are_in_the_notice(opened: Opener, gateway: FakeGateway) -> None:
+def test_problems_of_the_gateway_are_shown_in_a_notice(opened: Opener, gateway: FakeGateway) -> None:
     gateway.changes = {"troubles": ["history: nothing is recorded: No space left on device", "mqtt: <b>"]}
     page = opened()
     notice = page.locator("#notice")
@@ -193,7 +195,7 @@ def test_unknown_values_are_shown_as_a_dash_and_never_as_zero(opened: Opener, ga
 
 
 @pytest.mark.parametrize("off_s", [-90, 90])
-def test_a_wrong_clock_of_the_browser_is_reported_and_ages_stay_right(opened: Opener, off_s: int) -> None:
+def test_a_wrong_clock_of_the_browser_does_not_change_ages_of_values(opened: Opener, off_s: int) -> None:
     wrong = f"const now = Date.now; Date.now = () => now() + {off_s * 1000}"
     page = opened(prepare=lambda page: page.add_init_script(wrong))
     notice = page.locator("#notice")
@@ -203,7 +205,7 @@ def test_a_wrong_clock_of_the_browser_is_reported_and_ages_stay_right(opened: Op
     until_met(page, lambda: page.locator(FRESH).count() == 9)
 
 
-def test_times_are_shown_with_24_hours_in_utc_or_local_time_as_chosen(opened: Opener) -> None:
+def test_times_are_shown_in_utc_or_local_time_as_the_user_chooses(opened: Opener) -> None:
     page = opened(timezone_id="Asia/Kolkata", locale="en-US")
     clock = page.locator("#clock")
     assert re.fullmatch(r"\d\d:\d\d:\d\d UTC", clock.inner_text())
@@ -260,7 +262,7 @@ def test_a_page_without_scripts_says_that_stop_all_does_not_work(opened: Opener)
     assert page.locator("#stopall").is_disabled()
 
 
-def test_a_plot_draws_no_line_over_a_time_without_values(opened: Opener) -> None:
+def test_a_plot_has_a_gap_where_no_values_were_received(opened: Opener) -> None:
     """The page received no values for an hour, as on a laptop that slept."""
     page = opened()
     seen = page.evaluate("""() => import('/page/data/store.js').then(({ store, takeFrame }) => {
@@ -348,7 +350,7 @@ def check_row_on_a_phone(page: Any, name: str) -> None:
 # ---- with a real gateway that polls simulated drives ----
 
 
-def test_the_web_page_shows_a_polled_plant_and_stops_it_with_a_token(page: Any, tmp_path: Path) -> None:
+def test_the_web_page_can_stop_a_polled_plant_with_a_token(page: Any, tmp_path: Path) -> None:
     with served(tmp_path) as gateway:
         page.goto(f"http://localhost:{gateway.gateway.port}/")
         until(page, LIVE)
@@ -371,7 +373,7 @@ def test_the_web_page_shows_a_polled_plant_and_stops_it_with_a_token(page: Any, 
         page.locator("#log-list tbody tr").first.wait_for()
 
 
-def test_the_delay_of_values_over_a_network_of_8_kb_a_second_does_not_grow(page: Any, tmp_path: Path) -> None:
+def test_the_delay_of_values_does_not_grow_on_a_slow_network(page: Any, tmp_path: Path) -> None:
     """`python -m bench.questions.gateway.page` measures the delay itself."""
     with served(tmp_path, "", *(f"drive-{n}" for n in range(1, 13))) as gateway:
         page.goto(f"http://localhost:{gateway.gateway.port}/")

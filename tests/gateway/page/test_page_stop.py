@@ -144,7 +144,7 @@ def test_the_stop_all_button_works_while_another_dialog_is_open(opened: Opener, 
     assert gateway.posts == [("/api/stop", {"drives": None})]
 
 
-def test_the_result_of_one_stop_does_not_replace_the_question_of_another(
+def test_the_result_of_a_stop_does_not_replace_an_open_stop_dialog(
     opened: Opener, gateway: FakeGateway
 ) -> None:
     """The result of the stop of one drive arrives while the question of Stop all is open."""
@@ -243,7 +243,9 @@ def test_the_web_page_waits_for_the_result_of_an_accepted_stop(opened: Opener, g
     told(page, "All 10 drives are stopped")
 
 
-def test_an_emergency_stop_at_a_frozen_gateway_shows_a_warning(opened: Opener, gateway: FakeGateway) -> None:
+def test_a_warning_is_shown_if_an_emergency_stop_is_not_answered(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     page = opened("#/drives/pump-1")
     held: list[Any] = []
     page.route("**/api/act", lambda route: held.append(route))
@@ -418,7 +420,7 @@ def test_the_stop_keys_work_on_every_keyboard_layout(opened: Opener) -> None:
     }
 
 
-def test_the_stop_key_works_behind_a_dialog_but_not_in_a_text_field(opened: Opener) -> None:
+def test_the_stop_key_works_in_an_open_dialog_but_not_in_a_text_field(opened: Opener) -> None:
     page = opened("#/drives/pump-1")
     page.get_by_role("button", name="Change frequency setpoint").click()
     page.keyboard.press("Shift+S")  # typed into the text field
@@ -429,7 +431,7 @@ def test_the_stop_key_works_behind_a_dialog_but_not_in_a_text_field(opened: Open
 
 
 @pytest.mark.parametrize("verb", ["stop", "emergency stop"])
-def test_the_page_waits_longer_than_the_gateway_repeats_a_stop(
+def test_the_page_waits_until_the_gateway_has_given_up_a_stop(
     opened: Opener, gateway: FakeGateway, verb: str
 ) -> None:
     """With one dead drive, the page could otherwise never show which drives have stopped."""

@@ -194,7 +194,7 @@ def test_each_visible_text_of_a_script_has_a_translation(script: str) -> None:
         't("Stop {what}", { what: "a drive" })',
     ],
 )
-def test_a_visible_text_without_a_translation_is_found(script: str) -> None:
+def test_the_check_of_translations_finds_an_untranslated_text(script: str) -> None:
     assert strangers(script) != []
 
 
@@ -296,9 +296,7 @@ def english_in(texts: list[str]) -> set[str]:
 
 @pytest.mark.long
 @pytest.mark.parametrize("language", ["ru", "zh"])
-def test_each_translated_view_fits_a_narrow_screen_and_has_no_english_text(
-    opened: Opener, axe: str, language: str
-) -> None:
+def test_each_view_is_translated_and_fits_a_narrow_screen(opened: Opener, axe: str, language: str) -> None:
     page = opened(live=False, locale=language)
     page.set_viewport_size(NARROW)
     until(page, f"document.querySelector('#link').textContent === '{LIVE[language]}'")
@@ -337,7 +335,7 @@ def test_the_page_has_the_language_of_the_browser(opened: Opener, locale: str, l
 
 
 @pytest.mark.long
-def test_the_language_chosen_on_the_page_has_precedence_and_is_kept(opened: Opener) -> None:
+def test_the_language_chosen_on_the_page_overrides_the_browser_language(opened: Opener) -> None:
     page = opened(live=False, locale="ru-RU")
     page.locator("#link").get_by_text(LIVE["ru"], exact=True).wait_for()
     for title, language in (("中文", "zh"), ("English", "en")):
@@ -366,7 +364,9 @@ def test_the_page_shows_the_register_titles_that_the_gateway_sends(
 
 
 @pytest.mark.long
-def test_the_page_without_its_texts_is_english_and_can_stop(opened: Opener, gateway: FakeGateway) -> None:
+def test_the_page_is_english_if_its_translations_cannot_be_loaded(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     page = opened(live=False, locale="ru-RU", prepare=aborting("**/page/texts.ru.json"))
     page.locator("#link").get_by_text("live", exact=True).wait_for()
     assert page.locator("html").get_attribute("lang") == "en"
@@ -434,7 +434,7 @@ def test_the_web_page_refers_to_all_its_files_and_to_no_others() -> None:
     assert named - there == set()
 
 
-def test_each_kind_of_alarm_has_its_shape_colour_word_and_trend_bar() -> None:
+def test_each_kind_of_alarm_has_a_shape_a_colour_and_a_word() -> None:
     index, strip, lanes, table, bars, words = (
         (PAGE / name).read_text("utf-8")
         for name in (

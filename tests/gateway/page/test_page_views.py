@@ -60,7 +60,7 @@ def test_the_filter_hides_lines_without_matches(opened: Opener) -> None:
     assert page.locator("#table tbody tr:visible").count() == 0
 
 
-def test_in_a_large_plant_lines_without_problems_are_folded(opened: Opener, gateway: FakeGateway) -> None:
+def test_lines_without_problems_are_collapsed_in_a_large_plant(opened: Opener, gateway: FakeGateway) -> None:
     lines = [line_of_one(n, 50) for n in range(2)]
     for n, line in enumerate(lines):
         line["drives"] = [line["drives"][0] | {"name": f"fan-{n}-{i}"} for i in range(40)]
@@ -81,7 +81,7 @@ def test_in_a_large_plant_lines_without_problems_are_folded(opened: Opener, gate
     until_met(page, lambda: shown.count() == 11)
 
 
-def test_frequency_bars_of_all_drives_have_one_labelled_scale(opened: Opener, gateway: FakeGateway) -> None:
+def test_frequency_bars_of_all_drives_have_the_same_scale(opened: Opener, gateway: FakeGateway) -> None:
     """Bars of equal frequency have equal length, whatever the maximum frequencies of the drives."""
     gateway.plant_changes = {"lines": [line_of_one(0, 50), line_of_one(1, 320)]}
     rows = {"output_frequency": [41.0, 0], "frequency_setpoint": [48.0, 0]}
@@ -163,7 +163,7 @@ def test_a_long_unit_stays_within_its_table_column(opened: Opener, gateway: Fake
         until_met(page, lambda: min(states.evaluate_all(width)) >= 120)
 
 
-def test_words_about_a_drives_state_are_not_cut_off(opened: Opener) -> None:
+def test_the_text_about_the_state_of_a_drive_is_not_cut_off(opened: Opener) -> None:
     page = opened()
     words = page.locator("#table .word", has_text="overcurrent in acceleration")
     parts = "([word]) => [word.scrollWidth - word.clientWidth, word.clientHeight]"
@@ -282,7 +282,7 @@ CanvasRenderingContext2D.prototype.fillText = function (text, x, y) {
 }"""
 
 
-def test_trends_show_the_last_trigger_with_a_mark_at_its_moment(opened: Opener, gateway: FakeGateway) -> None:
+def test_trends_mark_the_moment_of_the_last_trigger(opened: Opener, gateway: FakeGateway) -> None:
     at = 1764075600000
     gateway.triggers = [
         trigger("trip", at, "output_current", "fault"),
@@ -319,7 +319,7 @@ def test_trends_show_the_last_trigger_with_a_mark_at_its_moment(opened: Opener, 
     [(False, "No history is kept"), (True, "The history has no values in this time range.")],
     ids=["no history", "a trigger that is older than the history"],
 )
-def test_a_trigger_without_values_in_the_history_shows_a_sentence(
+def test_a_message_is_shown_if_a_trigger_has_no_recorded_values(
     opened: Opener, gateway: FakeGateway, has_history: bool, sentence: str
 ) -> None:
     gateway.has_history = has_history
@@ -339,7 +339,9 @@ def test_a_trigger_without_values_in_the_history_shows_a_sentence(
     until_met(page, lambda: sentence in note.inner_text())
 
 
-def test_markers_and_cursor_show_the_newest_value_of_each_drive(opened: Opener, gateway: FakeGateway) -> None:
+def test_plot_markers_show_the_last_value_before_the_marked_time(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     """In a short range, the samples of the two drives have different times."""
     begin = 1764075600000
     for drive, offset in (("pump-1", 0), ("pump-2", 400)):
@@ -384,7 +386,7 @@ def test_an_unpolled_register_has_no_empty_plot(opened: Opener, gateway: FakeGat
     assert "output frequency, Hz" not in page.locator("#plots .legend").all_inner_texts()
 
 
-def test_a_date_range_can_be_chosen_and_an_end_before_its_start_is_refused(opened: Opener) -> None:
+def test_a_date_range_is_refused_if_the_end_is_before_the_start(opened: Opener) -> None:
     page = opened("#/trends?drive=pump-2&from=1764075600000&to=1764079200000")
     until(page, DRAWN)
     page.locator("#span").click()
@@ -436,9 +438,7 @@ def test_the_number_of_selected_drives_is_limited_to_the_number_of_line_styles(o
     assert checked == [True] * 24 + [False] * 7
 
 
-def test_the_time_before_the_start_is_not_shown_as_free_of_faults(
-    opened: Opener, gateway: FakeGateway
-) -> None:
+def test_faults_before_the_gateway_start_are_shown_as_unknown(opened: Opener, gateway: FakeGateway) -> None:
     """The gateway started in the middle of the shown hour."""
     page = opened("#/trends?drive=pump-2&from=1764075600000&to=1764079200000")
     lanes = page.locator("#lane .bars")
@@ -452,7 +452,7 @@ def test_the_time_before_the_start_is_not_shown_as_free_of_faults(
     assert all(abs(part - 0.5) < 0.02 for part in lanes.evaluate_all(part))
 
 
-def test_an_alarm_during_which_the_clock_was_set_back_has_a_bar(opened: Opener, gateway: FakeGateway) -> None:
+def test_trends_draw_an_alarm_although_the_clock_was_set_back(opened: Opener, gateway: FakeGateway) -> None:
     """The clock was set back by an hour, so the alarm ended before the shown hour started."""
     start, quarter = fake_plant.ms(time.time()) - 3_600_000, 900_000
     gateway.changes["alarms"] = [
@@ -495,7 +495,7 @@ def test_values_recorded_in_a_previous_unit_are_not_drawn(opened: Opener, gatewa
     assert said.nth(1).get_attribute("aria-label") == "output current: no values"
 
 
-def test_trends_are_exported_as_they_are_shown(opened: Opener) -> None:
+def test_an_export_contains_the_range_and_drives_of_the_shown_trends(opened: Opener) -> None:
     page = opened("#/trends?drive=pump-2&from=1764075600000&to=1764079200000")
     until(page, DRAWN)
     for name in ("CSV", "Parquet"):

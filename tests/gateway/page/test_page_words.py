@@ -64,7 +64,7 @@ def test_plots_and_markers_show_float_values(opened: Opener, gateway: FakeGatewa
     until_met(page, lambda: re.fullmatch(fraction, cell.inner_text()) is not None)
 
 
-def test_figures_of_a_lost_gateway_look_old(opened: Opener, gateway: FakeGateway) -> None:
+def test_numbers_look_old_if_the_gateway_cannot_be_reached(opened: Opener, gateway: FakeGateway) -> None:
     page = opened()
     figures = [page.locator(where).last for where in ("tr.head .wire span", "#chips b", "#strip li")]
     style = "element => getComputedStyle(element).fontStyle"
@@ -77,7 +77,7 @@ def test_figures_of_a_lost_gateway_look_old(opened: Opener, gateway: FakeGateway
     assert "counted yet" not in page.locator("#lines").inner_text()
 
 
-def test_fault_durations_are_correct_although_no_values_have_arrived_yet(
+def test_fault_durations_are_shown_before_the_first_values_arrive(
     opened: Opener, gateway: FakeGateway
 ) -> None:
     gateway.is_silent = True
@@ -122,7 +122,7 @@ def test_a_plant_with_one_drive_is_described_in_the_singular(opened: Opener, gat
     page.get_by_text(re.compile("· 1 drive$")).wait_for()
 
 
-def test_the_alarm_strip_has_the_colour_of_a_fault_that_does_not_fit(
+def test_the_alarm_strip_has_the_fault_colour_if_the_fault_is_hidden(
     opened: Opener, gateway: FakeGateway
 ) -> None:
     now = fake_plant.ms(time.time())
@@ -180,7 +180,9 @@ def test_the_age_of_an_old_value_is_shown(opened: Opener) -> None:
     until_met(page, lambda: bool(re.fullmatch(r"\d+ min", row.locator(".age").inner_text())))
 
 
-def test_a_value_read_for_viewers_is_old_if_its_drive_is_silent(opened: Opener, gateway: FakeGateway) -> None:
+def test_a_rarely_read_value_is_shown_as_old_if_its_drive_is_silent(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     """A viewed register may be read only once a minute. Its value stays current while the drive answers."""
     page = opened()
     value = page.locator("#panel tr", has_text="run hours").locator(".value")
@@ -196,7 +198,7 @@ def test_a_value_read_for_viewers_is_old_if_its_drive_is_silent(opened: Opener, 
     page.locator("#panel .value.old", has_text="4012").wait_for()
 
 
-def test_a_fault_text_that_does_not_fit_its_bar_ends_with_an_ellipsis(opened: Opener) -> None:
+def test_a_fault_text_ends_with_an_ellipsis_if_its_bar_is_too_short(opened: Opener) -> None:
     page: Any = opened("#/trends?drive=pump-1")
     bar = page.locator(".lane .fault")
     bar.wait_for()
@@ -268,7 +270,9 @@ def test_an_alarm_is_acknowledged_with_a_note(opened: Opener, alarmed: FakeGatew
     assert "there is no such alarm" in page.locator("#ask").inner_text()
 
 
-def test_many_failed_reads_show_a_warning_and_one_does_not(opened: Opener, gateway: FakeGateway) -> None:
+def test_a_warning_is_shown_for_many_failed_reads_but_not_for_one(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     gateway.drive_changes = {"pump-1": {"missed": 0.0003}, "pump-2": {"missed": 0.05}}
     gateway.changes = {"lines": {name: line | {"misses": 1} for name, line in lines().items()}}
     page = opened()
@@ -281,7 +285,7 @@ def test_many_failed_reads_show_a_warning_and_one_does_not(opened: Opener, gatew
     page.locator(".linehead .warn").first.wait_for()
 
 
-def test_a_drive_of_unknown_state_at_rest_is_not_faulty(opened: Opener, gateway: FakeGateway) -> None:
+def test_a_drive_at_0_hz_in_unknown_state_is_shown_as_at_rest(opened: Opener, gateway: FakeGateway) -> None:
     why = "the outputs are not programmed"
     gateway.drive_changes = {name: {"state": "unknown", "note": why} for name in ("pump-4", "pump-1")}
     page = opened("#/drives/pump-4")

@@ -50,7 +50,7 @@ def test_the_result_of_a_write_is_shown_in_the_gateways_words(opened: Opener, ga
     assert "the drive took 30.0 Hz instead" in page.locator("#outcomes").inner_text()
 
 
-def test_an_unanswered_command_is_unknown_and_not_repeated(opened: Opener, gateway: FakeGateway) -> None:
+def test_the_page_does_not_repeat_an_unanswered_command(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/drives/pump-1")
     page.route("**/api/act", lambda route: route.abort())
     page.get_by_role("button", name="start").click()
@@ -74,7 +74,7 @@ def test_a_command_with_a_truncated_answer_is_shown_as_unknown(opened: Opener, g
     page.locator("#writes").get_by_text("The gateway's answer was cut off.").wait_for()
 
 
-def test_the_enter_key_does_not_confirm_a_start(opened: Opener, gateway: FakeGateway) -> None:
+def test_the_enter_key_does_not_confirm_the_start_of_a_motor(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/drives/pump-1")
     page.get_by_role("button", name="start").click()
     assert page.locator("#ask-title").inner_text() == "start: pump-1?"
@@ -95,7 +95,7 @@ def test_pressing_enter_in_an_unchanged_dialog_writes_no_value(opened: Opener, g
     assert gateway.posts == []
 
 
-def test_a_key_that_is_held_down_counts_as_one_press(opened: Opener, gateway: FakeGateway) -> None:
+def test_a_held_key_counts_as_one_press(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/drives/pump-1")
     change = page.get_by_role("button", name="Change frequency setpoint")
     change.click()
@@ -111,7 +111,9 @@ def test_a_key_that_is_held_down_counts_as_one_press(opened: Opener, gateway: Fa
 
 
 @pytest.mark.parametrize("size", ["desk", "phone"])
-def test_a_double_click_on_start_does_not_confirm_it(opened: Opener, gateway: FakeGateway, size: str) -> None:
+def test_a_double_click_on_start_does_not_confirm_the_dialog(
+    opened: Opener, gateway: FakeGateway, size: str
+) -> None:
     """The confirming button of the dialog covers the start button, as on a scrolled phone."""
     page = opened("#/drives/pump-1", size)
     until_still(page)
@@ -146,7 +148,7 @@ SLOW_AT_CLICKS = f"""button => button.addEventListener('click', () => {{
 
 
 @pytest.mark.parametrize(("slows", "later_s"), [(False, 0.2), (True, 0.9)], ids=["at once", "on a slow page"])
-def test_a_second_tap_on_start_does_not_confirm_it(
+def test_a_second_tap_on_start_does_not_confirm_the_dialog(
     opened: Opener, gateway: FakeGateway, slows: bool, later_s: float
 ) -> None:
     """On a slow page, the second tap waits in the browser's queue until the dialog is drawn."""
@@ -182,7 +184,9 @@ def press(page: Any, key: str, made_s: float, text: str = "") -> None:
 
 
 @pytest.mark.parametrize(("key", "text"), [("Enter", "\r"), (" ", " ")], ids=["Enter", "Space"])
-def test_early_keys_confirm_no_dialog(opened: Opener, gateway: FakeGateway, key: str, text: str) -> None:
+def test_keys_pressed_before_a_dialog_is_visible_do_not_confirm_the_dialog(
+    opened: Opener, gateway: FakeGateway, key: str, text: str
+) -> None:
     """On a slow page, Tab and Enter could otherwise confirm a dialog before the user has seen it."""
     page = opened("#/drives/pump-1")
     until_still(page)
@@ -215,7 +219,7 @@ def test_a_confirmed_command_contains_the_newest_message_number(opened: Opener, 
 
 
 @pytest.mark.parametrize("event", ["a stop", "a reload"])
-def test_a_stop_or_reload_during_the_dialog_of_a_start_prevents_it(
+def test_a_start_is_not_sent_after_a_stop_or_reload_during_its_dialog(
     opened: Opener, gateway: FakeGateway, event: str
 ) -> None:
     """After a reload, the name in the dialog may mean another drive."""
@@ -238,7 +242,9 @@ def test_a_stop_or_reload_during_the_dialog_of_a_start_prevents_it(
     until_met(page, lambda: gateway.posts)
 
 
-def test_an_emergency_stop_is_sent_despite_a_stop_before_it(opened: Opener, gateway: FakeGateway) -> None:
+def test_an_emergency_stop_is_sent_although_another_stop_came_before(
+    opened: Opener, gateway: FakeGateway
+) -> None:
     page = opened("#/drives/pump-1")
     page.get_by_role("button", name="emergency stop").click()
     gateway.stops = {"pump-1": 1}
@@ -259,7 +265,7 @@ def test_no_button_moves_when_values_grow_old(opened: Opener, gateway: FakeGatew
     assert start.bounding_box() == before
 
 
-def test_commands_that_the_settings_forbid_are_not_offered(opened: Opener) -> None:
+def test_the_page_has_no_buttons_for_forbidden_commands(opened: Opener) -> None:
     page = opened("#/drives/pump-2")
     page.locator(".registers").wait_for()
     assert page.locator(".verbs button, .change").count() == 0
@@ -319,7 +325,7 @@ def told(page: Any, title: str) -> None:
     page.get_by_role("heading", name=title, exact=True).wait_for()
 
 
-def test_reload_by_keyboard_shows_mistakes(opened: Opener, gateway: FakeGateway) -> None:
+def test_mistakes_are_shown_after_a_reload_by_keyboard(opened: Opener, gateway: FakeGateway) -> None:
     mistakes = [f"plant.toml: [[line]] {n}: port is missing" for n in range(30)]
     text = "the previous plant stays in use: the file has mistakes"
     gateway.reloaded = {"done": False, "text": text, "mistakes": mistakes, "restart": []}
