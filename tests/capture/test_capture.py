@@ -88,7 +88,7 @@ def test_wireshark_reports_a_bad_checksum_in_a_capture(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_wireshark_shows_ascii_and_delixi_frames_as_they_are(tmp_path: Path) -> None:
+def test_wireshark_shows_ascii_and_delixi_frames_as_plain_data(tmp_path: Path) -> None:
     packets = tshark(write(tmp_path / "a.pcapng", TEXT))
     frames = [frame.hex() for each in TEXT for frame in (each.request_frame, each.frame)]
     assert [packet["data.data"] for packet in packets] == frames
@@ -96,7 +96,7 @@ def test_wireshark_shows_ascii_and_delixi_frames_as_they_are(tmp_path: Path) -> 
 
 
 @pytest.mark.long
-def test_each_line_is_a_pcapng_interface_with_the_lines_name(tmp_path: Path) -> None:
+def test_packets_of_each_line_have_the_line_name_as_pcapng_interface(tmp_path: Path) -> None:
     with CaptureWriter(tmp_path / "a.pcapng") as capture:
         for number, line in enumerate(("hall-1", "Halle zwei", "hall-1")):
             capture.write(RTU[0].frame, Side.ANSWERING, BEGIN + number, line)
@@ -136,7 +136,7 @@ def hexdump(packets: Iterable[bytes]) -> str:
 
 @pytest.mark.parametrize("format", usually("pcapng", "pcap", "nsecpcap"))
 @pytest.mark.parametrize("link", [147, 162, 250])
-def test_captures_of_wireshark_s_tools_are_read(tmp_path: Path, format: str, link: int) -> None:
+def test_captures_written_by_text2pcap_are_read(tmp_path: Path, format: str, link: int) -> None:
     frames = [frame for each in (*RTU, *TEXT) for frame in (each.request_frame, each.frame)]
     rtac = struct.pack(">IIBBH", 0, 0, 2, 0, 0) if link == 250 else b""
     path = tmp_path / f"other.{format}"
@@ -154,7 +154,7 @@ def test_captures_of_wireshark_s_tools_are_read(tmp_path: Path, format: str, lin
     assert [span.time_ns for span in found] == [first + n * 10**6 for n in range(len(frames))]
 
 
-def test_frames_are_read_even_if_packets_end_within_them(tmp_path: Path) -> None:
+def test_frames_split_between_packets_are_read_whole(tmp_path: Path) -> None:
     frames = b"".join(each.request_frame + each.frame for each in RTU)
     packets = [frames[at : at + 7] for at in range(0, len(frames), 7)]
     header = struct.pack(">IHHiIII", 0xA1B23C4D, 2, 4, 0, 0, 65535, 147)  # big-endian, ns
@@ -168,7 +168,7 @@ def test_frames_are_read_even_if_packets_end_within_them(tmp_path: Path) -> None
     assert {span.time_ns for span in found} == {10**9 + 5}
 
 
-def test_a_reply_in_pieces_with_pauses_is_one_frame(tmp_path: Path) -> None:
+def test_reply_split_into_packets_with_pauses_is_one_frame(tmp_path: Path) -> None:
     """A reply of 165 bytes comes in pieces of 32, as in alerighi/modbus-sniffer#9."""
     reply = checksums.rtu("0B 03 A0" + bytes((at * 7 + 3) % 256 for at in range(160)).hex())
     pieces = [checksums.rtu("0B 03 08 36 00 50"), *(reply[at : at + 32] for at in range(0, len(reply), 32))]
@@ -218,7 +218,7 @@ def test_a_capture_in_a_missing_directory_raises_a_one_sentence_error(tmp_path: 
     assert str(failure.value) == f"{path}: cannot be written: No such file or directory"
 
 
-def test_a_disk_that_becomes_full_leaves_whole_packets(tmp_path: Path) -> None:
+def test_disk_that_becomes_full_leaves_whole_packets_in_a_capture(tmp_path: Path) -> None:
     path = tmp_path / "a.pcapng"
     with CaptureWriter(path) as capture:
         capture.write(READ, Side.ASKING, BEGIN, "hall-1")
@@ -257,7 +257,7 @@ def plant(*drives: Toy) -> Plant:
     return Plant([PlantLine("hall", "pty", drives=[PolledDrive(drive) for drive in drives])])
 
 
-def test_replayed_registers_have_the_captured_values_at_their_times(capture: Path) -> None:
+def test_replayed_drive_repeats_captured_values_at_the_captured_times(capture: Path) -> None:
     drive = Replay(capture, plant(Toy(1))).drive(Toy(1))
     assert drive["output_frequency"] == 10.0
     start = 1000.0  # the time of the first request
@@ -277,7 +277,7 @@ def test_a_write_to_a_replayed_drive_lasts_until_the_next_captured_value(capture
     assert drive["output_frequency"] == 25.0
 
 
-def test_a_replayed_drive_that_was_not_captured_is_silent(capture: Path) -> None:
+def test_replayed_drive_sends_no_reply_if_missing_from_the_capture(capture: Path) -> None:
     replay = Replay(capture, plant(Toy(1), Toy(2, name="other")))
     assert replay.drive(Toy(2, name="other")).answer(Message(2, 3, 1, 1), 0.0) is None
 
@@ -387,7 +387,7 @@ def described(*options: tuple[int, bytes]) -> bytes:
     return section + struct.pack("<II", 1, size) + interface + struct.pack("<I", size)
 
 
-def test_an_empty_time_resolution_option_of_pcapng_means_the_default(tmp_path: Path) -> None:
+def test_capture_with_an_empty_time_resolution_option_is_read(tmp_path: Path) -> None:
     (tmp_path / "a.pcapng").write_bytes(described((9, b"")))
     assert spans(tmp_path / "a.pcapng") == {"a-0": []}
 
@@ -464,7 +464,7 @@ def test_invalid_captures_raise_a_one_sentence_error(tmp_path: Path, content: by
     assert str(mistake.value) == f"{path}{sentence}"
 
 
-def test_a_capture_cut_within_an_interface_block_is_read_up_to_that_block(tmp_path: Path) -> None:
+def test_capture_ending_in_an_incomplete_interface_block_is_read(tmp_path: Path) -> None:
     path = tmp_path / "a.pcapng"
     path.write_bytes(described()[:-6])
     with Capture(path) as capture:
@@ -473,7 +473,7 @@ def test_a_capture_cut_within_an_interface_block_is_read_up_to_that_block(tmp_pa
 
 
 @table("tags", [b"\0\x0c\0\x05mb", b"\0\x0c\0\x05mbrtu", b"\0\x0c\xff\xff", b"\0\0\0\0", b"\0"])
-def test_a_packet_that_ends_within_its_tags_is_empty(tmp_path: Path, tags: bytes) -> None:
+def test_packet_with_incomplete_tags_gives_no_frame(tmp_path: Path, tags: bytes) -> None:
     """A packet of the link type "exported PDU" starts with tags that describe its frame."""
     path = tmp_path / "a.pcapng"
     interface = block(1, struct.pack("<HHI", 252, 0, 0))
@@ -517,7 +517,7 @@ def test_a_cut_capture_is_read_up_to_the_last_whole_packet(tmp_path: Path, forma
 
 
 @pytest.mark.parametrize("piece", [200, 256, 333, 512])
-def test_decoded_rows_do_not_depend_on_the_size_of_read_pieces(
+def test_size_of_the_read_buffer_does_not_change_decoded_rows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, piece: int
 ) -> None:
     path = write(tmp_path / "it.pcapng", RTU[:40])

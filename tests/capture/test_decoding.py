@@ -83,13 +83,13 @@ def test_a_capture_without_a_plant_is_decoded_to_raw_registers(tmp_path: Path) -
     ]
 
 
-def test_an_exception_reply_is_a_row_with_its_code_as_status(tmp_path: Path) -> None:
+def test_decoded_exception_reply_has_the_exception_code_as_status(tmp_path: Path) -> None:
     exchange = next(each for each in RTU if _text(each.frame) == "01 83 03 01 31")
     found = rows(write(tmp_path / "a.pcapng", [exchange]))
     assert {(row.value, row.status) for row in found} == {(None, "exception 03")}
 
 
-def test_an_unanswered_request_is_a_row_with_the_reason_as_status(tmp_path: Path) -> None:
+def test_decoded_request_without_a_valid_reply_has_the_reason_as_status(tmp_path: Path) -> None:
     exchange = next(each for each in RTU if _text(each.frame) == "01 03 02 13 88 B5 12")
     with CaptureWriter(tmp_path / "a.pcapng") as capture:
         capture.write(exchange.request_frame, Side.ASKING, 1, "hall-1")
@@ -103,7 +103,7 @@ def test_an_unanswered_request_is_a_row_with_the_reason_as_status(tmp_path: Path
 
 
 @pytest.mark.long
-def test_register_names_beyond_the_batch_limit_start_another_batch(tmp_path: Path) -> None:
+def test_decoder_starts_a_new_batch_at_the_limit_of_register_names(tmp_path: Path) -> None:
     """All 65536 holding registers are read, and then some input registers."""
     ends = {3: 65500, 4: 10_000}
     with CaptureWriter(tmp_path / "a.pcapng") as capture:
@@ -133,7 +133,7 @@ def frames_of(path: Path, exchanges: Iterable[tuple[Message, Message | None]]) -
 
 @pytest.mark.long
 @pytest.mark.parametrize(("data", "end"), usually((b"\0\7", (7, "ok")), (b"", (None, "no reply"))))
-def test_requests_beyond_the_decoders_cache_size_are_decoded_too(
+def test_decoder_decodes_more_requests_than_fit_its_cache(
     tmp_path: Path, data: bytes, end: tuple[float | None, str]
 ) -> None:
     """The decoder's hash table of requests has 16384 places, and counts as full at 12288 requests."""
@@ -169,7 +169,7 @@ def test_a_request_for_too_many_registers_is_decoded_to_at_most_125_rows(tmp_pat
 @pytest.mark.parametrize(
     ("reply", "end"), [(Message(1, 3, 0, 100, bytes(200)), (0, "ok")), (None, (None, "no reply"))]
 )
-def test_decoded_rows_beyond_the_batch_limit_start_another_batch(
+def test_decoder_starts_a_new_batch_at_the_limit_of_rows(
     tmp_path: Path, reply: Message | None, end: tuple[float | None, str]
 ) -> None:
     """The rows of one exchange are never divided between two batches."""

@@ -202,7 +202,7 @@ def epoch(time_ns: int) -> str:
 @pytest.mark.parametrize(
     "make", [pytest.param(rough_wires, id="rough"), pytest.param(echoing_wires, id="echoing")]
 )
-def test_a_capture_of_a_disturbed_line_has_the_polled_rows(
+def test_capture_of_a_line_with_faults_decodes_to_the_polled_rows(
     tmp_path: Path, make: Callable[[], list[Wire]]
 ) -> None:
     drives = [polled(drive, drive.readings()) for drive in fast_drives()]
@@ -236,7 +236,7 @@ def asking(peer: Peer | None = None) -> Exchange:
     )
 
 
-def test_bytes_lost_from_a_full_capture_buffer_are_counted() -> None:
+def test_bytes_lost_due_to_a_full_capture_buffer_are_counted() -> None:
     """Noise fills the tap's buffer until 4000 bytes are lost."""
     driver, tap, told = LineDriver(), Tap(), 0
     driver.begin(asking())
@@ -253,7 +253,7 @@ def test_bytes_lost_from_a_full_capture_buffer_are_counted() -> None:
     ]
 
 
-def test_a_capture_has_the_noise_around_a_reply() -> None:
+def test_capture_contains_noise_before_and_after_a_reply() -> None:
     """The noise before the reply is longer than the line's buffer."""
     driver, tap = LineDriver(), Tap()
     driver.begin(asking())
@@ -325,7 +325,9 @@ def seconds_in(path: Path) -> list[int]:
         ]
 
 
-def test_a_recorder_saves_traffic_around_an_anomaly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_flight_recorder_saves_traffic_around_an_anomaly(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     one_flight = Flight(tmp_path / "flights", monkeypatch, seconds=20)
     one_flight.pass_(50)
     assert one_flight.recorder.written == []
@@ -339,7 +341,9 @@ def test_a_recorder_saves_traffic_around_an_anomaly(tmp_path: Path, monkeypatch:
     assert b"hall-1: pump-1: bad checksum; hall-1: pump-2: fell silent\0" in path.read_bytes()[:200]
 
 
-def test_two_recorders_may_write_in_the_same_second(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_flight_recorders_write_different_files_in_the_same_second(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for _ in range(2):
         one_flight = Flight(tmp_path, monkeypatch)  # the clocks of both recorders start at the same time
         one_flight.pass_(10, "hall-1: pump-1: bad checksum")
@@ -350,7 +354,9 @@ def test_two_recorders_may_write_in_the_same_second(tmp_path: Path, monkeypatch:
     ]
 
 
-def test_flight_recordings_do_not_fill_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_flight_recorder_keeps_at_most_the_allowed_number_of_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     one_flight = Flight(tmp_path, monkeypatch, seconds=20, most_files=3)
     (tmp_path / "flight-plan.pcapng").touch()  # a user's own file
     for _ in range(600):
@@ -362,12 +368,12 @@ def test_flight_recordings_do_not_fill_the_disk(tmp_path: Path, monkeypatch: pyt
 
 
 @pytest.mark.parametrize("most_files", [0, -1])
-def test_a_flight_recorder_that_may_keep_no_file_is_refused(tmp_path: Path, most_files: int) -> None:
+def test_flight_recorder_refuses_a_file_limit_below_one(tmp_path: Path, most_files: int) -> None:
     with pytest.raises(ValueError, match=f"most_files = {most_files} is not 1 or more"):
         FlightRecorder(tmp_path, ["hall-1"], most_files=most_files)
 
 
-def test_a_flight_recorder_keeps_its_limit_of_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_flight_recorder_limits_its_buffered_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     one_flight = Flight(tmp_path, monkeypatch, most_bytes=1000)
     one_flight.pass_(200, "hall-1: the port was lost")
     one_flight.recorder.close()
@@ -377,7 +383,7 @@ def test_a_flight_recorder_keeps_its_limit_of_memory(tmp_path: Path, monkeypatch
     assert seconds == list(range(seconds[0], 1201))
 
 
-def test_a_recorder_writes_pending_anomalies_when_it_is_closed(
+def test_closing_a_flight_recorder_writes_the_pending_anomaly(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one_flight = Flight(tmp_path, monkeypatch)
@@ -389,7 +395,7 @@ def test_a_recorder_writes_pending_anomalies_when_it_is_closed(
     assert [seconds_in(path) for path in one_flight.recorder.written] == [list(range(1001, 1007))]
 
 
-def test_a_flight_recorder_in_an_impossible_directory_raises_one_sentence(tmp_path: Path) -> None:
+def test_flight_recorder_in_an_unwritable_directory_raises_recording_error(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(RecordingError, match="cannot be written"):
         FlightRecorder(tmp_path / "file" / "flights", [])
@@ -435,7 +441,7 @@ def test_damaged_and_late_replies_are_reported_as_anomalies() -> None:
     assert pump.told(GOOD) == ["hall-1: pump-1: late reply"]
 
 
-def test_a_drive_that_falls_silent_causes_one_anomaly() -> None:
+def test_drive_causes_one_anomaly_when_replies_stop() -> None:
     pump = Watched()
     assert [pump.told(b"") for _ in range(5)] == [[]] * 5  # no anomaly: the drive has never answered
     assert pump.told(GOOD) == []

@@ -44,7 +44,7 @@ ENERGY = Channel("energy", "integral(power)", "kWh")
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in range(1, 10))])
-def test_the_energy_total_equals_the_analytic_integral_although_5_percent_are_missing(seed: int) -> None:
+def test_energy_total_is_accurate_with_5_percent_of_values_missing(seed: int) -> None:
     """The power is 2 + sin(t / 7 s) kW for 10 minutes, read about every 100 ms."""
     random_, made = missing(0.05, seed), channels(ENERGY, power="kW")
     rows, missed = [], 0
@@ -69,7 +69,7 @@ def test_the_volume_is_the_integral_of_a_flow(flow_unit: str, unit: str, total: 
     assert [one.value for one in found if one.slot == 2][-1] == pytest.approx(total)
 
 
-def test_an_outage_is_reported_and_adds_nothing_to_a_computed_total() -> None:
+def test_outage_adds_nothing_to_a_computed_total() -> None:
     made = channels(ENERGY, power="kW")
     assert last_value(made, [row(0, at, 3600.0) for at in (0.0, 1.0)]) == 1.0
     silent = made.compute([row(0, at, None) for at in (2.0, 3.0, 4.0)])
@@ -81,7 +81,7 @@ def test_an_outage_is_reported_and_adds_nothing_to_a_computed_total() -> None:
     assert str(weekend) == "pump.energy: 216000 s without values are not counted"
 
 
-def test_a_total_continues_across_missing_values_within_the_holding_time() -> None:
+def test_total_continues_after_a_short_gap_without_an_outage() -> None:
     made = channels(ENERGY, power="kW")
     rows = [row(0, 0.0, 3600.0), row(0, 0.5, None), row(0, 1.0, 7200.0)]
     assert last_value(made, rows) == 1.5
@@ -94,7 +94,7 @@ def test_a_total_continues_across_missing_values_within_the_holding_time() -> No
     ids=["without rows", "with a miss"],
 )
 @table("value", ["integral(power + pump-2.power)", "integral(both)"])
-def test_a_total_has_an_outage_while_the_value_of_another_line_is_too_old(
+def test_total_has_an_outage_while_another_drives_value_is_too_old(
     value: str, misses: list[SlotRow], status: int, known_until_s: int
 ) -> None:
     """Each of two drives has a power of 1800 kW, and values are valid for 30 s. One is silent for 40 s."""
@@ -120,14 +120,14 @@ def test_the_run_hours_and_the_number_of_starts_are_computed() -> None:
     assert found[-2].value == pytest.approx((1 + 0.5 + 0.5 + 0.5 + 0.5 + 1) / 3600)
 
 
-def test_a_derivative_needs_two_values_without_an_outage_between_them() -> None:
+def test_derivative_has_no_value_directly_after_an_outage() -> None:
     made = channels(Channel("slope", "derivative(frequency)", "Hz/s"), frequency="Hz")
     found = made.compute([row(0, 0.0, 10.0), row(0, 0.5, 15.0), row(0, 5.0, 0.0), row(0, 5.5, 1.0)])
     shown = [(one.value, one.status) for one in found]
     assert shown == [(0.0, Status.NO_VALUE), (10.0, 0), (0.0, Status.NO_VALUE), (2.0, 0)]
 
 
-def test_a_computed_row_has_the_status_and_time_of_the_newest_missing_value() -> None:
+def test_computed_row_has_the_status_of_the_missing_value() -> None:
     made = channels(Channel("power", "voltage * current", "W"), voltage="V", current="A")
     assert made.compute([row(0, 1.0, 400.0)]) == []  # the register with the current has no value yet
     (first,) = made.compute([row(0, 2.0, 400.0), row(1, 2.0, 2.0)])  # one request
@@ -138,7 +138,7 @@ def test_a_computed_row_has_the_status_and_time_of_the_newest_missing_value() ->
     assert [one.status for one in found] == [Status.NO_REPLY, Status.NO_REPLY]
 
 
-def test_each_of_several_rows_with_the_same_time_gives_a_computed_row() -> None:
+def test_rows_with_the_same_time_each_give_a_computed_row() -> None:
     made = channels(Channel("double", "2 * current", "A"), current="A")
     found = made.compute([row(0, 1.0, None), row(0, 1.0, None), row(0, 1.0, 3.0)])
     assert [one.status for one in found] == [Status.NO_REPLY, Status.NO_REPLY, Status.OK]
@@ -197,7 +197,7 @@ def test_an_integral_skips_the_time_while_a_drive_is_replaced() -> None:
     assert list(map(str, second.outages)) == ["pump.energy: 0.5 s without values are not counted"]
 
 
-def test_a_total_with_a_changed_expression_or_damaged_file_starts_at_0() -> None:
+def test_total_starts_at_zero_if_the_saved_total_does_not_fit() -> None:
     before = channels(ENERGY, power="kW")
     before.compute([row(0, at, 3600.0) for at in (0.0, 1.0)])
     good = before.totals()["pump.energy"]
@@ -222,7 +222,7 @@ def test_a_saved_total_with_an_invalid_time_is_restored(time_ns: object) -> None
     assert last_value(made, [row(0, 0.0, 1.0)]) == 2.0
 
 
-def test_a_total_that_is_declared_as_not_kept_starts_at_0_after_a_restart() -> None:
+def test_total_declared_as_not_kept_is_not_restored() -> None:
     kept, other = channels(ENERGY, power="kW"), channels(replace(ENERGY, is_kept=False), power="kW")
     for made in (kept, other):
         made.compute([row(0, at, 3600.0) for at in (0.0, 1.0)])
@@ -231,7 +231,7 @@ def test_a_total_that_is_declared_as_not_kept_starts_at_0_after_a_restart() -> N
     assert last_value(other, [row(0, 2.0, 0.0)]) == 1.5
 
 
-def test_several_outages_before_the_next_value_are_reported_together() -> None:
+def test_consecutive_outages_of_a_total_are_reported_as_one() -> None:
     made = channels(Channel("both", "integral(a) + b", "A*s"), a="A", b="A*s")
     made.compute([row(0, 0.0, 1.0), row(1, 0.5, 1.0), row(1, 1.0, None), row(0, 5.0, 1.0)])
     made.compute([row(0, 10.0, 1.0), row(1, 10.5, 1.0), row(0, 10.6, 1.0)])

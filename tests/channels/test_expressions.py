@@ -99,7 +99,7 @@ def test_a_channel_expression_has_the_expected_value(expression: str, unit: str,
         "current / (status - 3) > 1 or status > 3",
     ],
 )
-def test_a_channel_expression_without_a_finite_result_has_no_value(expression: str) -> None:
+def test_channel_has_no_value_if_the_result_is_not_finite(expression: str) -> None:
     assert value_of(expression, "A" if "current" in expression and ">" not in expression else "") is None
 
 
@@ -160,7 +160,7 @@ def test_a_mistake_in_a_channel_expression_is_reported_with_its_column(expressio
         *(('as(current, "mW")', "mW", ""), ('as(current, "nm")', "nm", ""), ('as(current, "S")', "S", "")),
     ],
 )
-def test_a_unit_with_wrong_upper_or_lower_case_is_refused_with_the_right_unit(
+def test_error_for_a_unit_in_wrong_case_suggests_the_right_unit(
     expression: str, unit: str, hint: str
 ) -> None:
     if not hint:
@@ -198,7 +198,7 @@ def test_a_unit_suggested_by_the_error_is_accepted(expression: str, unit: str, v
         ("W/m²", "kW/m2", 0.001),
     ],
 )
-def test_each_value_is_converted_by_the_factor_between_its_units(one: str, other: str, factor: float) -> None:
+def test_unit_conversion_uses_the_expected_factor(one: str, other: str, factor: float) -> None:
     assert unit_of(one).is_like(unit_of(other))
     assert unit_of(one).factor / unit_of(other).factor == pytest.approx(factor, rel=1e-12)
 
@@ -267,7 +267,7 @@ def texts(seed: int, count: int) -> Iterator[str]:
 
 
 @pytest.mark.parametrize("count", [500, pytest.param(MANY, marks=pytest.mark.long)])
-def test_any_text_as_an_expression_is_computed_or_refused_with_bounded_work(count: int) -> None:
+def test_any_text_as_an_expression_is_computed_or_refused(count: int) -> None:
     """Check that each text is computed or refused, and that the work is bounded by the text's length."""
     series = SeriesTable(PUMPS)
     values: list[float | None] = [NOW.get(name, 700.0) for _, name in series.slots]
@@ -295,7 +295,7 @@ LONGEST = {  # near the limits of length and depth
 
 
 @pytest.mark.parametrize("kind", LONGEST)
-def test_the_work_of_an_evaluation_is_bounded_by_the_length_of_the_text(kind: str) -> None:
+def test_work_of_an_evaluation_is_limited_by_expression_length(kind: str) -> None:
     """Count the lines of Python code that one evaluation executes, instead of its time."""
     text = LONGEST[kind]
     series = SeriesTable(PUMPS)

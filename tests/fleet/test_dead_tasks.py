@@ -137,7 +137,7 @@ def test_a_killed_task_ends_the_gateway(gateway: Any, name: str, caplog: pytest.
     assert f"{name} has ended and is not restarted: it was cancelled" in caplog.text
 
 
-def test_the_exception_that_ended_a_task_is_logged_with_its_cause(
+def test_exception_of_an_ended_task_is_logged_with_the_cause(
     gateway: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     async def kill(made: FleetGateway) -> None:
@@ -149,9 +149,7 @@ def test_the_exception_that_ended_a_task_is_logged_with_its_cause(
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_the_gateway_ends_when_the_thread_of_its_spool_ends(
-    gateway: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_gateway_ends_when_the_spool_thread_ends(gateway: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     def leave() -> bool:
         raise SystemExit
 
@@ -172,7 +170,9 @@ def test_the_gateway_shuts_down_if_polling_has_failed(gateway: Any) -> None:
         gateway(kill)
 
 
-def test_the_gateway_ends_if_it_cannot_get_commands(gateway: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gateway_ends_if_it_cannot_subscribe_to_commands(
+    gateway: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A gateway without the subscription would miss stops."""
 
     async def kill(made: FleetGateway) -> None:
@@ -191,7 +191,7 @@ async def test_a_command_client_reports_the_end_of_its_connection(fleet: Cluster
             await asyncio.wait_for(commands.stay(), 60)
 
 
-async def test_an_unexpected_failure_of_the_forwarder_is_logged_and_it_retries(
+async def test_forwarder_retries_after_an_unexpected_failure(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(samples_stream, "AGAIN_S", 0.0)
@@ -264,7 +264,9 @@ def test_an_error_while_metrics_are_computed_gives_status_500(caplog: pytest.Log
     assert "Ill: a mistake" in caplog.text
 
 
-def test_a_stop_that_raises_is_answered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stop_with_an_unexpected_error_is_answered_as_unknown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with desks(tmp_path) as desk:
         monkeypatch.setattr(desk.stops._repeated, "begin", lambda *details: asyncio.run(fail()))
         answer = asyncio.run(desk.stop())
@@ -299,7 +301,7 @@ def taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Taken]:
 
 
 @pytest.mark.parametrize("failure", [Ill("amid it"), MemoryError(), SystemExit("of a user")], ids=repr)
-async def test_a_line_that_fails_to_open_is_not_polled(
+async def test_port_is_closed_again_if_opening_a_line_fails(
     taken: Taken, monkeypatch: pytest.MonkeyPatch, failure: BaseException
 ) -> None:
     """The line's port must be closed again, because another gateway may soon poll the line."""
@@ -315,7 +317,7 @@ async def test_a_line_that_fails_to_open_is_not_polled(
     assert taken.lines.poller.buses == {}
 
 
-async def test_a_line_whose_commands_cannot_be_received_is_not_polled(
+async def test_line_is_not_polled_if_the_gateway_cannot_receive_commands(
     taken: Taken, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     log = CommandLog(tmp_path / "commands.jsonl")
@@ -391,7 +393,7 @@ async def test_end_tasks_returns_the_error_of_a_task_that_has_ended() -> None:
     assert str(found) == "the disk is full"
 
 
-async def test_closing_a_client_for_commands_ends_tasks_that_ignore_a_cancellation(tmp_path: Path) -> None:
+async def test_closing_a_command_client_ends_tasks_that_ignore_one_cancellation(tmp_path: Path) -> None:
     fleet = FleetCommands(["nats://127.0.0.1:1"], by="anna", log=tmp_path / "commands.jsonl")
     fleet._keeping = [await _begun(1)]
     await asyncio.wait_for(fleet.close(), PATIENCE_S)

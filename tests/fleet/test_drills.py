@@ -45,7 +45,7 @@ def drill(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FleetDrill]:
         yield found
 
 
-def test_a_suspended_gateway_is_killed_and_its_lines_are_taken_over(drill: FleetDrill) -> None:
+def test_other_gateways_take_over_the_lines_of_a_suspended_gateway(drill: FleetDrill) -> None:
     stopped: list[subprocess.Popen[str]] = []
     drill.settle()
     gaps = drill.judge(lambda: stopped.append(drill.stop_gateway()), seconds=1.0)
@@ -93,7 +93,7 @@ def test_no_line_has_two_masters_while_cables_are_cut(cut_drill: FleetDrill, nam
     assert cut_drill.hall.overlaps() == 0
 
 
-def test_a_gateway_that_is_cut_off_from_its_lines_hands_them_over(cut_drill: FleetDrill) -> None:
+def test_gateway_hands_over_lines_that_it_cannot_reach(cut_drill: FleetDrill) -> None:
     cut_drill.settle()
     place, host = cut_drill.places["gw-a"], cut_drill.hall.host
 

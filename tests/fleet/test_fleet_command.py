@@ -183,11 +183,11 @@ def test_mistakes_in_permission_lists_are_reported(run: Run, nobody: str, tmp_pa
         ),
     ],
 )
-def test_each_command_line_mistake_prints_one_sentence(run: Run, words: list[str], sentence: str) -> None:
+def test_fleet_command_line_mistake_prints_one_sentence(run: Run, words: list[str], sentence: str) -> None:
     assert sentence in one_sentence(run("fleet", *words))
 
 
-def test_a_stop_is_sent_even_if_the_name_of_its_sender_is_invalid(run: Run, nobody: str) -> None:
+def test_stop_command_is_sent_despite_an_invalid_sender_name(run: Run, nobody: str) -> None:
     _, _, said = run("fleet", "stop", "pump-1", "--by", "\x1b[31m" + "x" * 300, "--nats", nobody)
     assert "the stop was NOT sent: no NATS server answers" in said
 
@@ -268,7 +268,7 @@ async def test_an_interrupted_stop_reports_that_its_outcome_is_unknown(
 # ---- `fleet demo` shows a takeover, and always removes its processes and files ----
 
 
-async def test_the_demo_waits_until_each_line_keeps_its_master() -> None:
+async def test_demo_waits_until_no_line_changes_its_master() -> None:
     stage = Stage()
 
     async def look(master: str) -> None:

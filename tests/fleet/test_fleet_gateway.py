@@ -75,7 +75,7 @@ async def test_a_gateway_without_a_session_answers_no_requests(tmp_path: Path) -
     await gateway._close()
 
 
-async def test_a_gateway_answers_only_to_subjects_that_are_inboxes(tmp_path: Path) -> None:
+async def test_gateway_answers_only_to_nats_inbox_subjects(tmp_path: Path) -> None:
     """Servers send an answer to any subject that a requester names, even one that it may not write to."""
     gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
     gateway.member.lease.session = 7
@@ -112,13 +112,15 @@ async def test_shutdown_waits_until_samples_are_forwarded_if_the_stream_works(
     await gateway._close()
 
 
-async def test_the_remaining_time_of_a_gateway_without_a_lease_is_zero(tmp_path: Path) -> None:
+async def test_gateway_without_a_lease_reports_zero_remaining_lease_time(tmp_path: Path) -> None:
     gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
     assert gateway.state()["margin_s"] == 0.0
     await gateway._close()
 
 
-async def test_closing_lines_cancels_their_timer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_closing_all_lines_cancels_the_kernel_timer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """If the timer stayed set, it would later kill the process."""
     gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
     gateway.mastership.extend(time.clock_gettime_ns(time.CLOCK_BOOTTIME) + 3600 * 10**9)
@@ -137,7 +139,7 @@ async def test_closing_lines_cancels_their_timer(tmp_path: Path, monkeypatch: py
         gateway.mastership.end()
 
 
-async def test_the_kernel_timer_and_the_file_lock_are_kept_if_the_lines_cannot_be_closed(
+async def test_kernel_timer_is_kept_if_lines_cannot_be_closed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The process could still send, so no other process may believe that it is dead."""
@@ -161,7 +163,7 @@ async def test_the_kernel_timer_and_the_file_lock_are_kept_if_the_lines_cannot_b
 
 
 @pytest.mark.parametrize("part", ["paths", "spool", "log"])
-async def test_the_gateway_closes_its_other_parts_after_one_part_fails_to_close(
+async def test_gateway_closes_everything_else_after_one_close_fails(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: str
 ) -> None:
     gateway = FleetGateway("gw-1", ["nats://127.0.0.1:1"], tmp_path)
@@ -239,7 +241,9 @@ def test_a_missing_nats_library_is_named(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize("dying", ["path", "watch", "commander", "path of samples", "rows", "lines"])
-def test_a_failed_task_ends_its_part(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, dying: str) -> None:
+def test_fleet_page_ends_if_one_of_its_tasks_fails(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, dying: str
+) -> None:
     """If the part did not end, the page would show an old view of the fleet forever."""
 
     async def go_on(*details: object) -> None:
@@ -447,7 +451,7 @@ def test_metrics_show_the_state_of_a_gateway() -> None:
     assert {name: value for name, value in found.items() if "{" not in name} == expected
 
 
-def test_metrics_leave_out_figures_that_are_unknown() -> None:
+def test_metrics_omit_unknown_figures() -> None:
     spool = STATE["spool"] | {"behind": None, "lag_s": None}
     found = samples(STATE | {"session": 0, "margin_s": 0.0, "state": "no lease", "spool": spool})
     missing = {"lease_margin_seconds", "session", "behind_messages", "behind_seconds"}
@@ -530,7 +534,7 @@ INVALID = r"is not an address and port; write --metrics 127\.0\.0\.1:9464"
         *((one, INVALID) for one in ("9464", "127.0.0.1", "127.0.0.1:x", ":9464", "127.0.0.1:99999")),
     ],
 )
-def test_metrics_addresses_that_are_invalid_or_not_local_are_rejected(address: str, sentence: str) -> None:
+def test_invalid_or_remote_metrics_address_is_rejected(address: str, sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
         listen(address)
 
@@ -542,7 +546,7 @@ def test_a_metrics_port_in_use_is_reported_in_one_sentence() -> None:
             listen(f"127.0.0.1:{port}")
 
 
-async def test_clients_of_the_metrics_port_are_limited_and_do_not_delay_its_end() -> None:
+async def test_number_of_clients_of_the_metrics_port_is_limited() -> None:
     """Clients beyond the limit, and clients that send too much, are disconnected."""
 
     async def ask(port: int, data: bytes) -> bytes:

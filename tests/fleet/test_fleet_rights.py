@@ -168,7 +168,7 @@ def refusals_where_all_is_allowed(tmp_path_factory: pytest.TempPathFactory) -> s
 
 
 @pytest.mark.parametrize("user", FORBIDDEN)
-def test_the_server_refuses_each_request_that_a_user_has_no_right_to_send(
+def test_server_refuses_each_request_without_the_needed_right(
     user: str, refusals: set[Attempt], refusals_where_all_is_allowed: set[Attempt]
 ) -> None:
     wanted = {attempt for attempt in attempts() if attempt.user == user}
@@ -301,7 +301,7 @@ def test_invalid_arguments_write_no_file(run: Run, tmp_path: Path, words: list[s
     assert not (tmp_path / "nats").exists()
 
 
-def test_a_request_counts_as_unsent_only_if_this_request_was_denied() -> None:
+def test_denial_of_an_earlier_request_does_not_affect_later_requests() -> None:
     """Rights may change while a connection is open, so the denial of an earlier request proves nothing."""
     denials = Denials()
     denied = Exception('nats: permissions violation for publish to "stop.line-1"')
@@ -405,7 +405,7 @@ def test_a_whole_fleet_works_with_the_generated_rights(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.long
-def test_a_gateway_with_a_revoked_key_logs_it_and_others_take_its_lines(tmp_path: Path) -> None:
+def test_other_gateways_take_the_lines_of_a_gateway_with_a_revoked_key(tmp_path: Path) -> None:
     """When the servers reload their rights, they disconnect users that were removed."""
     with secured_fleet(tmp_path, 1, ("gw-a", "gw-b")) as fleet:
         fleet.wait_for_polling()
@@ -459,7 +459,7 @@ def test_a_thief_with_a_gateways_key_can_only_interrupt_polling(tmp_path: Path) 
 
 @pytest.mark.slow
 @pytest.mark.long
-def test_clocks_an_hour_apart_are_logged_and_harmless(tmp_path: Path) -> None:
+def test_fleet_works_with_clocks_an_hour_apart(tmp_path: Path) -> None:
     """The clock of one of two gateways is an hour ahead. Each gateway takes over the lines of the other."""
     (tmp_path / "ahead").mkdir()
     (tmp_path / "ahead" / "sitecustomize.py").write_text(AN_HOUR_AHEAD)

@@ -84,7 +84,7 @@ def test_a_terminal_of_80_by_24_shows_twelve_lines_with_their_masters() -> None:
     assert "last moves:" in text
 
 
-def test_a_note_that_does_not_fit_on_the_screen_is_left_out() -> None:
+def test_screen_shows_only_the_newest_notes_that_fit() -> None:
     notes = {"notes": [f"{at} " + "words " * 20 for at in range(3)]}
     shown = drawn(told() | notes, 80).splitlines()
     assert [row[0] for row in shown if re.match(r"\d words", row)] == ["1", "2"]
@@ -125,14 +125,14 @@ def test_long_text_is_wrapped_or_marked_as_cut() -> None:
 
 
 @table("height", range(1, 60))
-def test_the_screen_shows_no_table_head_without_a_row_below_it(height: int) -> None:
+def test_each_table_header_on_the_screen_has_a_row_below(height: int) -> None:
     rows = drawn(told(lines=12), 80, height).splitlines()
     for row, next_row in pairwise(rows):
         if row.startswith(("LINE ", "last moves")):
             assert re.match(r"line-|1970-", next_row), (row, next_row)
 
 
-def test_lines_whose_master_does_not_answer_are_listed_early_and_in_red() -> None:
+def test_screen_lists_lines_early_if_the_master_does_not_answer() -> None:
     """If all gateways are dead, none ends the others' sessions, so records still name them as masters."""
     found = told(lines=12)
     assert "1 without a master\n" in drawn(found)
@@ -243,7 +243,7 @@ async def test_a_failed_read_shows_the_last_view_with_its_age(monkeypatch: pytes
     assert shown[0]["age_s"] < shown[1]["age_s"] < shown[2]["age_s"]
 
 
-async def test_watch_ends_when_the_task_of_its_connection_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_fleet_watch_ends_when_the_connection_task_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     """A `fleet watch` without a connection would show an old view forever."""
     monkeypatch.setattr(views, "EVERY_S", 0.01)
     supervisor().keep("path", asyncio.sleep(0)).cancel()

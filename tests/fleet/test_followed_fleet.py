@@ -86,7 +86,7 @@ def test_an_ok_sample_without_value_is_shown_as_no_valid_value(monkeypatch: pyte
     assert not any(columns.valid)
 
 
-def test_a_gateway_with_endless_names_and_statuses_is_tolerated(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_number_of_names_and_statuses_from_samples_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
     array("H", [followed.MOST_NAMES, followed.MOST_STATUSES])  # raises OverflowError above 16 bits
     monkeypatch.setattr(followed, "MOST_NAMES", 5)
     monkeypatch.setattr(followed, "MOST_STATUSES", 3)
@@ -103,7 +103,7 @@ def test_a_gateway_with_endless_names_and_statuses_is_tolerated(monkeypatch: pyt
     assert (len(columns.statuses), columns.statuses[-1], max(columns.status)) == (4, "other", 3)
 
 
-def test_samples_get_monotonic_times_of_the_computer_that_shows_them() -> None:
+def test_received_samples_get_monotonic_times_of_this_computer() -> None:
     reader = reader_by(Clocks(1.0))
     found = reader.rows([message(0)])
     columns = found.columns()
@@ -148,7 +148,7 @@ def test_forged_and_damaged_messages_are_ignored() -> None:
         (-40.0, "the clock of gw-1 is 40 s ahead of this computer's"),
     ],
 )
-def test_a_gateways_wrong_clock_is_reported_and_no_sample_is_in_the_future(
+def test_wrong_clock_of_a_gateway_is_reported(
     monkeypatch: pytest.MonkeyPatch, utc_s: float, sentence: str
 ) -> None:
     clocks = Clocks(utc_s)
@@ -237,7 +237,7 @@ def test_only_multidrop_serve_with_a_fleet_accepts_a_plant_without_lines(tmp_pat
         ),
     ],
 )
-def test_parts_that_need_lines_are_refused_in_a_plant_without_lines(
+def test_settings_that_need_lines_are_refused_in_a_plant_without_lines(
     tmp_path: Path, more: str, sentence: str
 ) -> None:
     path = tmp_path / "page.toml"
@@ -420,7 +420,7 @@ def looked(made: FleetView) -> dict[str, Any]:
     return made.fleet()
 
 
-def test_a_line_of_a_gateway_that_has_ended_is_shown_without_a_master() -> None:
+def test_line_is_shown_without_a_master_after_the_gateway_session_ended() -> None:
     found = looked(view())
     assert {name: line["master"] for name, line in found["lines"].items()} == {
         "line-1": "gw-1",
@@ -451,7 +451,7 @@ def test_an_invalid_list_of_changed_masters_in_an_answer_is_ignored(moves: Any) 
     assert found["gateways"]["gw-1"]["says"] == STATE
 
 
-def test_a_gateway_whose_session_another_gateway_ended_is_listed_as_missing() -> None:
+def test_gateway_is_listed_as_missing_if_another_gateway_ended_its_session() -> None:
     now_ms = time.time_ns() // 1_000_000
     made = view()
     died = {  # newest record in each lease bucket, and whether the gateway counts as missing, by gateway
@@ -482,7 +482,7 @@ def test_a_gateway_whose_session_another_gateway_ended_is_listed_as_missing() ->
     assert found["gateways"]["gw-4"]["session"] == 3
 
 
-def test_an_error_without_a_connection_contains_the_urls_of_the_servers() -> None:
+def test_error_without_a_connection_names_the_server_urls() -> None:
     made = view()
     made._path.is_open = False
     with pytest.raises(FleetError, match="no NATS server can be reached at nats://a:4222"):

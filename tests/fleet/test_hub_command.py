@@ -66,7 +66,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
 
 
 @pytest.mark.slow
-def test_a_hub_with_the_option_once_stores_every_row_of_the_stream_once(
+def test_hub_option_once_stores_all_rows_and_exits(
     running: Cluster, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     require_module("duckdb")
@@ -111,7 +111,7 @@ def test_stored_rows_survive_a_closed_terminal_or_sigterm(
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_cancels_the_hubs_task_and_raises_no_exception_elsewhere(
+def test_signal_cancels_only_the_hubs_own_task(
     running: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
 ) -> None:
     """An exception that a signal handler raises inside nats-py's own tasks would leave pending futures."""
@@ -130,7 +130,7 @@ def test_a_signal_cancels_the_hubs_task_and_raises_no_exception_elsewhere(
     assert done == ["went on", "ended"]
 
 
-def test_the_hub_fails_if_compaction_ends(
+def test_hub_exits_with_an_error_if_compaction_fails(
     running: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     async def end(folder: Path) -> None:

@@ -154,7 +154,7 @@ async def test_a_gateway_survives_invalid_records(one: Cluster, monkeypatch: pyt
 
 
 @pytest.mark.long
-async def test_a_session_ended_early_by_another_gateway_is_polled_until_its_lease_expires(
+async def test_wrongly_ended_session_keeps_its_lines_until_the_lease_expires(
     one: Cluster,
 ) -> None:
     """The gateway's process may hang. Its engine then continues to poll until the lease expires."""
@@ -332,7 +332,7 @@ async def test_an_invalid_time_in_a_servers_answer_is_reported(name: str) -> Non
 LONG = {**STATE, "trouble": "x" * 10**6, "troubles": {"hall": "y" * 10**6}}
 
 
-async def test_long_texts_in_a_gateways_state_are_cut_by_sender_and_receiver() -> None:
+async def test_long_texts_in_a_gateway_state_are_shortened() -> None:
     """NATS limits the size of an answer, and the page shows each text of an answer without shortening it."""
     answers: list[bytes] = []
 

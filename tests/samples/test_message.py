@@ -86,7 +86,7 @@ def test_a_message_with_the_longest_text_of_an_event_is_accepted() -> None:
 
 
 @table(("ns", "told"), [(1, 1000), (1000, 1000), (1001, 2000), (3 * 10**12, (2**31 - 1) * 1000)])
-def test_an_uncertainty_is_rounded_up(ns: int, told: int) -> None:
+def test_time_uncertainty_of_a_sample_is_rounded_up(ns: int, told: int) -> None:
     """The last uncertainty, 50 minutes, exceeds 32 bits and is capped. No request takes that long."""
     columns = Columns(1)
     assert add_rows(columns, block(0, 0), completion(SECOND, first_ns=SECOND + ns, words=(1,)), UTC_0)
@@ -121,7 +121,7 @@ def test_a_row_buffer_refuses_rows_of_another_poller() -> None:
 
 
 @pytest.mark.long
-def test_damaged_messages_raise_no_other_error_than_message_error() -> None:
+def test_damaged_messages_raise_only_message_error() -> None:
     (message,) = packed(numbered(0, 40))
     whole = unpack(message.data)
     dice = random.Random(7)
@@ -188,7 +188,7 @@ def written(options: pa.ipc.IpcWriteOptions | None = None, **other: pa.Array) ->
         ("uncertainty_us", pa.array([1, 1 << 31], pa.int64()), "Integer value 2147483648 not in range"),
     ],
 )
-def test_rows_that_no_store_accepts_are_rejected(column: str, rows: pa.Array, said: str) -> None:
+def test_message_with_unstorable_rows_is_rejected(column: str, rows: pa.Array, said: str) -> None:
     """A hub that accepted such rows could store no later message of any gateway."""
     with pytest.raises(MessageError, match=f"bytes are not a message of samples: {said}"):
         unpack(written(**{column: rows}))
@@ -294,7 +294,9 @@ def test_a_message_in_an_older_arrow_format_is_rejected() -> None:
 
 
 @pytest.mark.parametrize("options", [None, ZSTD, pa.ipc.IpcWriteOptions(compression="lz4")])
-def test_the_unpacked_size_equals_that_of_pyarrows_buffers(options: pa.ipc.IpcWriteOptions | None) -> None:
+def test_computed_unpacked_size_equals_the_size_of_pyarrow_buffers(
+    options: pa.ipc.IpcWriteOptions | None,
+) -> None:
     """Equal texts are stored compressed, and random numbers uncompressed. Empty lists have no bytes."""
     dice = random.Random(3)
     data = written(
@@ -314,7 +316,7 @@ def test_the_unpacked_size_equals_that_of_pyarrows_buffers(options: pa.ipc.IpcWr
     assert unpacked_size(data) == sum(buffer.size for buffer in buffers if buffer)
 
 
-def test_a_message_is_split_before_it_is_too_large_to_be_unpacked() -> None:
+def test_rows_are_split_into_messages_small_enough_to_be_unpacked() -> None:
     """Long names of many drives compress well, so a small message may be too large when unpacked."""
     drives = Names([f"{number:0900d}" for number in range(6000)])
     columns = Columns(6000)

@@ -190,7 +190,9 @@ def test_a_spool_file_is_synced_before_it_is_renamed(folder: Path, monkeypatch: 
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(("kills", "longest_s"), first_in_ci((3, 0.2), (12, 0.6)))
-def test_a_killed_process_loses_no_row_that_it_reported(folder: Path, kills: int, longest_s: float) -> None:
+def test_rows_reported_as_stored_survive_the_kill_of_the_process(
+    folder: Path, kills: int, longest_s: float
+) -> None:
     """Each run starts at another number. All reported rows are stored once, in order, without gaps."""
     dice = random.Random(kills)
     support = os.pathsep.join(map(str, Path(spooled.__file__).parents[1].iterdir()))
@@ -237,7 +239,7 @@ def test_a_full_spool_removes_its_oldest_messages(folder: Path, caplog: pytest.L
 
 
 @pytest.mark.parametrize(("most", "sent", "lost"), [(1000, 2, 4), (4, 4, 2), (4, 3, 6)])
-def test_removed_rows_are_counted_as_lost_at_the_next_acknowledgement(
+def test_removed_unsent_rows_are_counted_as_lost_after_acknowledgement(
     folder: Path, monkeypatch: pytest.MonkeyPatch, most: int, sent: int, lost: int
 ) -> None:
     """If more messages are removed than the spool remembers, it counts whole ranges of messages as lost."""
@@ -357,7 +359,9 @@ def test_a_hanging_disk_does_not_delay_the_poller(spool: Spool, monkeypatch: pyt
     assert spool.sync(30.0)
 
 
-def test_lost_rows_are_not_written_later(spool: Spool, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_counted_as_lost_are_not_written_later(
+    spool: Spool, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     really = RowBuffer.messages
 
     def messages(self: RowBuffer, **options: Any) -> Iterator[Packed]:
@@ -401,7 +405,7 @@ def test_a_spool_refuses_a_folder_with_an_invalid_spool_json(folder: Path, text:
         Spool(folder, GATEWAY)
 
 
-def test_a_spool_refuses_a_folder_that_it_cannot_write() -> None:
+def test_spool_refuses_an_unwritable_folder() -> None:
     with (
         read_only_directory() as path,
         pytest.raises(SpoolError, match=f"the spool {path} cannot be written: Permission denied"),

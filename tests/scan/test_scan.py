@@ -150,7 +150,7 @@ def test_scan_sends_only_reads(whole_scan: tuple[Line, list[object]]) -> None:
 
 
 @pytest.mark.slow
-def test_drives_at_usual_settings_are_found_within_15_s() -> None:
+def test_drives_at_default_settings_are_found_within_15_s() -> None:
     line = Line(Pair([simulated(each) for each in ALL_EIGHT]))
     soon = [each for each in ALL_EIGHT if each.settings == type(each)(1, framing=each.framing).settings]
     assert len(soon) == 4
@@ -199,7 +199,7 @@ class Echo(Line):
 
 @pytest.mark.long
 @pytest.mark.parametrize("families", [FAMILIES, [DelixiNative]], ids=["all", "own protocol"])
-def test_an_adapters_echo_is_not_reported_as_a_drive_and_hides_no_drive(families: list[type]) -> None:
+def test_scan_through_an_echoing_adapter_finds_exactly_the_drives(families: list[type]) -> None:
     there = [each for each in ALL_EIGHT if type(each) in families and each.settings.baudrate in (9600, 19200)]
     line = Echo(Pair([simulated(each) for each in ALL_EIGHT]))
     plan = sweeps(families, addresses=range(1, 12), baudrates=[9600, 19200])
@@ -313,7 +313,7 @@ class OneAfterTheOther(Shared):
         return reply if answer is None else reply + build_reply(self.twin.drive.framing, answer)
 
 
-def test_two_replies_to_one_request_are_reported_as_a_possible_second_drive() -> None:
+def test_scan_suspects_a_second_drive_after_two_replies_to_one_request() -> None:
     one, twin = simulated(InnovertIBD(3)), simulated(InnovertIBD(3))
     line = Line(OneAfterTheOther([one, simulated(InnovertIBD(4))], twin))
     findings = found(line, sweeps([InnovertIBD], baudrates=[9600], formats=["8N1"]), [InnovertIBD])
@@ -341,7 +341,7 @@ class Hesitant(SimulatedCHE):
         return super().delay if self.counters.requests <= 4 else 0.4
 
 
-def test_drive_that_becomes_slow_during_a_scan_is_identified() -> None:
+def test_drive_is_identified_even_if_it_becomes_slow_during_a_scan() -> None:
     line = Line(Pair([Hesitant(InvtCHE(3))]))
     plan = sweeps([InvtCHE], baudrates=[9600], formats=["8N1"])
     assert drives(found(line, plan, FAMILIES)) == declared(InvtCHE(3))
@@ -357,7 +357,7 @@ def test_slow_replies_lengthen_the_timeouts_of_later_sweeps() -> None:
     assert left[31] > usual[31]
 
 
-def test_drive_that_fits_no_family_is_found_without_a_model() -> None:
+def test_unknown_drive_is_found_without_a_model() -> None:
     line = Line(Pair([SimulatedDrive(Toy(7))]))
     (answering,) = found(line, sweeps(FAMILIES, baudrates=[9600], formats=["8N1"]))
     assert isinstance(answering, Found)
@@ -365,7 +365,7 @@ def test_drive_that_fits_no_family_is_found_without_a_model() -> None:
 
 
 @pytest.mark.slow
-def test_drive_of_a_users_family_is_found() -> None:
+def test_scan_finds_a_drive_of_a_user_defined_family() -> None:
     line = Line(Pair([SimulatedDrive(Toy(7, baudrate=19200)), simulated(InvtCHE(2))]))
     families = [*FAMILIES, Unsure]
     findings = found(line, sweeps(families, baudrates=[9600, 19200], formats=["8N1"]), families)
@@ -392,7 +392,7 @@ class Older(SimulatedDrive):
     ("kind", "held", "models"),
     [(SimulatedDrive, 7, ("addressed",)), (SimulatedDrive, 9, ()), (Older, 0, ("addressed",))],
 )
-def test_drive_whose_address_register_differs_does_not_fit_the_family(
+def test_drive_does_not_fit_a_family_if_the_address_register_differs(
     kind: type[SimulatedDrive], held: int, models: tuple[str, ...]
 ) -> None:
     drive = kind(Addressed(7))
@@ -418,7 +418,7 @@ class Meddler(Toy):
         return True
 
 
-def test_identify_script_that_would_write_is_not_carried_out() -> None:
+def test_scan_does_not_run_an_identify_script_that_writes() -> None:
     drive = SimulatedDrive(Meddler(7))
     plan = sweeps([Meddler], baudrates=[9600], formats=["8N1"])
     findings = found(Line(Pair([drive])), plan, [Meddler])
@@ -438,7 +438,7 @@ def test_a_family_without_readable_registers_is_skipped() -> None:
     assert {family for sweep in plan for family in sweep.families} == {InvtCHE}
 
 
-def test_drive_that_answers_in_two_formats_is_reported_once() -> None:
+def test_drive_is_reported_once_if_it_answers_in_two_serial_formats() -> None:
     line = Line(Pair([simulated(InvtCHE(2, format="8N2"))]))
     findings = found(line, sweeps([InvtCHE], baudrates=[9600], formats=["8N1", "8N2"]), [InvtCHE])
     assert len(drives(findings)) == 1
@@ -480,7 +480,7 @@ def test_lost_port_raises_line_error_after_the_findings_so_far() -> None:
         list(findings)
 
 
-def test_port_that_supports_no_setting_raises_line_error() -> None:
+def test_scan_raises_line_error_if_the_port_supports_no_setting() -> None:
     line = Stubborn(Pair([simulated(InvtCHE(2))]))
     with pytest.raises(LineError, match="parity"):
         found(line, sweeps([InvtCHE], baudrates=[9600], formats=["8E1"]))
@@ -498,7 +498,7 @@ def test_port_that_supports_no_setting_raises_line_error() -> None:
         ),
     ],
 )
-def test_a_setting_outside_all_families_raises_value_error(
+def test_scan_setting_that_no_family_supports_raises_value_error(
     asked: dict[str, list[object]], sentence: str
 ) -> None:
     with pytest.raises(ValueError, match=sentence):
@@ -545,7 +545,7 @@ def test_an_innovert_ibd_with_unreadable_line_settings_is_reported_as_uncertain(
 
 
 @pytest.mark.long
-def test_unusual_upper_bits_of_the_terminal_register_exclude_an_innovert_ibd() -> None:
+def test_wrong_terminal_register_bits_exclude_an_innovert_ibd() -> None:
     for bits in (0x0000, 0x0800, 0x1000, 0x9800, 0xFFFF):
         drive = Bare(InnovertIBD(3))
         drive.read_handlers = {**Bare.read_handlers, "terminals": lambda self, bits=bits: bits}
@@ -563,7 +563,7 @@ class Anything(SimulatedDrive):
 
 
 @pytest.mark.slow
-def test_device_that_answers_every_read_with_0_fits_no_family() -> None:
+def test_device_fits_no_family_if_every_read_returns_0() -> None:
     line = Line(Pair([Anything(Toy(7))]))
     (answering,) = found(line, sweeps(FAMILIES, baudrates=[9600]))
     assert isinstance(answering, Found)

@@ -99,11 +99,11 @@ def test_value_set_on_a_simulated_drive_is_read_over_the_line(
     assert sim[name] == value
 
 
-def test_simulated_drive_returns_factory_values_and_0_in_readable_gaps(sim: SimulatedDrive) -> None:
+def test_simulated_drive_returns_0_for_undeclared_readable_registers(sim: SimulatedDrive) -> None:
     assert data_of(ask(sim, 3, 0x10, 4)) == "00 32 00 00 00 00 00 00"
 
 
-def test_one_read_returns_registers_that_different_functions_write() -> None:
+def test_one_read_returns_registers_with_different_write_functions() -> None:
     class Controller(Drive):
         """A drive with a register that only function 16 writes."""
 
@@ -173,7 +173,7 @@ def test_simulated_drive_refuses_a_negative_value_below_its_limit(sim: Simulated
     assert exception_of(ask(sim, 6, 0x40, data=b"\xff\x9b")) == 3
 
 
-def test_simulated_drive_that_is_off_does_not_reply(sim: SimulatedDrive) -> None:
+def test_switched_off_simulated_drive_does_not_reply(sim: SimulatedDrive) -> None:
     sim.deaf_until = math.inf
     assert ask(sim, 4, 1, 1) is None
     assert sim.counters.requests == 0
@@ -205,7 +205,7 @@ def test_simulated_drive_without_broadcasts_in_its_class_ignores_them() -> None:
     assert sim["frequency"] == 0
 
 
-def test_eeprom_writes_are_counted_but_not_writes_to_the_ram_address(sim: SimulatedDrive) -> None:
+def test_simulated_drive_counts_writes_to_eeprom_but_not_to_ram(sim: SimulatedDrive) -> None:
     ask(sim, 6, 0x10, data=b"\x00\xc8")
     ask(sim, 6, 0x10, data=b"\x00\xc8")
     ask(sim, 6, 0x8010, data=b"\x01\x90")
@@ -235,7 +235,7 @@ def test_value_of_a_write_only_register_can_be_read_by_the_test(sim: SimulatedDr
     assert sim["frequency"] == 50
 
 
-def test_users_class_gets_a_simulated_drive_without_a_motor() -> None:
+def test_simulated_drive_of_a_user_defined_class_has_no_motor() -> None:
     assert type(simulated(Own(3))) is SimulatedDrive
 
 
@@ -249,7 +249,7 @@ def every_register() -> list[tuple[Register[float], int]]:
 
 
 @table(("register", "at"), every_register())
-def test_fixed_values_are_computed_from_address_table_and_register(
+def test_encoded_drive_computes_each_value_from_the_register_address(
     register: Register[float], at: int
 ) -> None:
     sim = EncodedDrive(Own(7))
@@ -263,7 +263,7 @@ def test_fixed_values_are_computed_from_address_table_and_register(
     assert int.from_bytes(reply.data) == expected & width
 
 
-def test_a_simulated_drive_with_fixed_values_confirms_writes_but_ignores_them() -> None:
+def test_encoded_drive_confirms_writes_without_storing_values() -> None:
     sim = EncodedDrive(Own(7))
     before = ask(sim, 3, 0x10, 1)
     request = Message(7, 6, 0x10, data=b"\x00\xc8")
@@ -271,7 +271,7 @@ def test_a_simulated_drive_with_fixed_values_confirms_writes_but_ignores_them() 
     assert ask(sim, 3, 0x10, 1) == before
 
 
-def test_registers_of_simulated_drives_with_fixed_values_have_different_values() -> None:
+def test_registers_of_encoded_drives_have_different_values() -> None:
     tables = (HOLDING, INPUT, Table("another", 7, None))
     codes = {encoded(address, table, at) for address in range(1, 9) for table in tables for at in range(8)}
     assert len(codes) == 8 * 3 * 8
@@ -437,7 +437,7 @@ def test_run_time_of_a_simulated_motor_counts_only_while_it_runs(motor: Motor) -
     assert motor.run_seconds == 7200
 
 
-def test_a_simulated_motor_ignores_an_earlier_time(motor: Motor) -> None:
+def test_simulated_motor_does_not_go_back_in_time(motor: Motor) -> None:
     motor.run()
     motor.run_to(4)
     motor.run_to(3)

@@ -309,7 +309,7 @@ def test_a_running_simulated_innovert_ibd_is_reversed_by_direction_bits_alone(ib
         assert ibd.motor.energised
 
 
-def test_jog_of_a_simulated_innovert_ibd_is_ended_only_by_a_stop(ibd: Bench) -> None:
+def test_simulated_innovert_ibd_jogs_until_a_stop_command(ibd: Bench) -> None:
     ibd.write(0x2001, 5000)
     ibd.write(0x2000, 3)
     ibd.wait(60)
@@ -326,7 +326,7 @@ def test_jog_of_a_simulated_innovert_ibd_is_ended_only_by_a_stop(ibd: Bench) -> 
     assert ibd.motor.frequency == 50
 
 
-def test_a_trip_ends_a_jog_of_a_simulated_innovert_ibd(ibd: Bench) -> None:
+def test_fault_ends_jogging_of_a_simulated_innovert_ibd(ibd: Bench) -> None:
     ibd.write(0x2001, 5000)
     ibd.write(0x2000, 3)
     ibd.sim.trip(1)
@@ -336,7 +336,7 @@ def test_a_trip_ends_a_jog_of_a_simulated_innovert_ibd(ibd: Bench) -> None:
     assert ibd.motor.frequency == 50
 
 
-def test_simulated_innovert_ibd_obeys_the_line_only_if_its_parameters_select_it(ibd: Bench) -> None:
+def test_simulated_innovert_ibd_obeys_the_line_only_if_configured(ibd: Bench) -> None:
     ibd.write(0x2001, 5000)
     ibd.write(102, 0)  # Prb.02
     assert ibd.write(0x2000, 2) == 0
@@ -386,7 +386,7 @@ def test_simulated_innovert_ibd_carries_out_a_broadcast_without_a_reply(ibd: Ben
     assert not ibd.motor.energised
 
 
-def test_delixis_forward_command_resets_a_fault_of_a_simulated_innovert_ibd(ibd: Bench) -> None:
+def test_command_word_10h_resets_a_fault_of_a_simulated_innovert_ibd(ibd: Bench) -> None:
     ibd.sim.trip(1)
     ibd.exchange("01 06 20 00 00 10 83 C6")  # frame made by hand from the manual's tables
     assert (ibd.motor.fault, ibd.motor.energised) == (0, False)
@@ -413,7 +413,7 @@ def test_simulated_delixi_output_frequency_is_read_in_ascii_as_documented() -> N
     assert delixi.exchange(":010301F4000106") == ":01030213885F"
 
 
-def test_simulated_delixi_obeys_the_line_only_if_its_parameters_select_it(delixi: Bench) -> None:
+def test_simulated_delixi_obeys_the_line_only_if_configured(delixi: Bench) -> None:
     delixi.exchange("01 06 00 02 13 88 25 5C")
     delixi.sim["run_source"] = 0  # P00.00
     assert delixi.exchange("01 06 20 00 00 12 02 07") == "01 06 20 00 00 12 02 07"
@@ -608,7 +608,7 @@ def test_simulated_yd1000_obeys_the_panel_while_bit_15_is_off(yd: Bench) -> None
     assert yd.motor.frequency == 30
 
 
-def test_a_trip_of_a_simulated_yd1000_freezes_only_1200h_and_1201h(yd: Bench) -> None:
+def test_emergency_stop_freezes_two_registers_of_a_simulated_yd1000(yd: Bench) -> None:
     run_at(yd, 5000)
     yd.read(3, 0x1200)
     yd.write(0x1000, STOP | 1 << 12)  # emergency stop
@@ -621,7 +621,7 @@ def test_a_trip_of_a_simulated_yd1000_freezes_only_1200h_and_1201h(yd: Bench) ->
     assert yd.read(3, 0x1210) != [0]
 
 
-def test_simulated_yd1000_ignores_requests_while_a_reset_restarts_it(yd: Bench) -> None:
+def test_simulated_yd1000_ignores_requests_during_a_restart(yd: Bench) -> None:
     yd.write(0x1001, 5000)
     yd.sim.trip(3)
     assert yd.write(0x1000, RESET) == 0
@@ -713,7 +713,7 @@ def test_limits_of_a_simulated_yd1000_follow_other_parameters(yd: Bench) -> None
 
 
 @pytest.mark.parametrize("address", [0x0001, 0x0007, 0x0015])
-def test_simulated_yd1000_does_not_store_parameters_of_its_panel(yd: Bench, address: int) -> None:
+def test_simulated_yd1000_confirms_panel_parameters_without_storing(yd: Bench, address: int) -> None:
     assert yd.write(address, 1) == 0
     assert yd.read(3, address) == [0]
     assert not yd.sim.counters.eeprom_writes
@@ -821,7 +821,7 @@ def test_simulated_registers_are_readable_and_writable_as_declared(family: type[
 
 
 @table("family", [ErmanERG220, InvtCHE, InnovertIBD, DelixiModbus, DelixiNative, YD1000])
-def test_a_simulated_drive_with_fixed_values_is_readable_in_every_family(family: type[Drive]) -> None:
+def test_encoded_drive_returns_expected_values_in_every_family(family: type[Drive]) -> None:
     """Each register, read with whole frames, has the value that `encoded` or `known_counts` returns."""
     drive = family(5)
     known = drive.known_counts()

@@ -98,7 +98,7 @@ def test_a_simulated_line_can_send_two_replies_together() -> None:
     assert received[-1][0] < 0.5
 
 
-def test_a_delayed_reply_is_sent_alone_if_no_other_reply_follows() -> None:
+def test_delayed_reply_is_sent_alone_if_no_further_reply_follows() -> None:
     line = LineClient(merge=1, late=0.2)
     received = line.after()
     assert b"".join(piece for _, piece in received) == REPLY
@@ -192,13 +192,13 @@ def test_overload_fault_code_of_every_family_is_valid(model: type[Drive]) -> Non
     assert 0 < overload_code(drive) < 0x10000
 
 
-def test_a_simulated_trip_is_refused_for_a_drive_without_a_motor() -> None:
+def test_faults_file_may_not_trip_a_drive_without_a_motor() -> None:
     with pytest.raises(ValueError, match="flaky has no simulated motor: remove its keys `trip` and `drift`"):
         two_drives(trip=1.0)
 
 
 @pytest.mark.parametrize("port", ["link", "socket://127.0.0.1:0"])
-def test_simulated_port_that_was_removed_returns_at_its_path(port: str, tmp_path: Path) -> None:
+def test_simulated_port_returns_at_the_same_path_after_a_hang_up(port: str, tmp_path: Path) -> None:
     where = str(tmp_path / port) if port == "link" else port
     wire = FaultyWire([simulated(Toy(1))], Faults(hang_up=1, away=0.02, rename=1), port=where, unpaced=True)
     with Simulator([wire]) as sim:

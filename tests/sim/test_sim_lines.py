@@ -235,7 +235,7 @@ def test_terminated_simulator_process_removes_its_link(tmp_path: Path) -> None:
 PATIENCE = 60.0
 
 
-def test_signal_ends_the_simulator_even_if_its_handler_has_not_run() -> None:
+def test_signal_to_another_thread_ends_the_simulator() -> None:
     """The signal goes to another thread, so its handler does not run before the main thread sleeps."""
 
     def terminate() -> None:
@@ -274,7 +274,7 @@ class IllDrive(EncodedDrive):
 
 
 @pytest.mark.long
-def test_simulated_drive_that_fails_does_not_disturb_other_lines(caplog: pytest.LogCaptureFixture) -> None:
+def test_failing_simulated_drive_does_not_disturb_other_lines(caplog: pytest.LogCaptureFixture) -> None:
     wires = [Wire([drive], unpaced=True) for drive in (IllDrive(Toy(1)), EncodedDrive(Toy(1)))]
     simulator = Simulator(wires)
 
@@ -292,7 +292,7 @@ def test_simulated_drive_that_fails_does_not_disturb_other_lines(caplog: pytest.
     assert [record.name for record in caplog.records if record.levelname == "ERROR"] == ["multidrop.sim"]
 
 
-def test_simulator_thread_that_ends_logs_its_failure(
+def test_failure_of_the_simulator_thread_is_logged(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     simulator = Simulator([Wire([EncodedDrive(Toy(1))])])
@@ -321,7 +321,7 @@ def test_option_speed_makes_simulated_time_pass_faster() -> None:
 
 
 @table("speed", [0, -1, float("inf"), float("nan")])
-def test_simulator_speed_that_is_not_positive_is_refused(speed: float) -> None:
+def test_simulator_refuses_an_invalid_speed(speed: float) -> None:
     with pytest.raises(ValueError, match="is not a positive number"):
         Simulator([], speed=speed)
 
@@ -453,7 +453,7 @@ def test_documented_pytest_examples_pass_in_parallel_processes(
     assert re.search(r"^11 passed", done.stdout, re.MULTILINE), done.stdout + done.stderr
 
 
-def test_pytest_plugin_simulates_each_line_of_a_plant_at_a_port_of_its_kind(
+def test_pytest_plugin_simulates_serial_and_tcp_lines_of_a_plant(
     tmp_path: Path, simulated_plant: Callable[..., SimulatedPlant]
 ) -> None:
     path = tmp_path / "plant.toml"

@@ -28,7 +28,7 @@ def exchange(wire: Wire, frame: bytes, now: float, baudrate: int | None = None) 
     return b"".join(piece for _, piece in timeline(wire, now + 5))
 
 
-def test_simulated_reply_starts_after_the_requests_end_and_the_response_delay() -> None:
+def test_simulated_reply_starts_one_response_delay_after_the_request() -> None:
     wire = Wire([SimulatedDrive(Own(1, baudrate=9600), response_delay=0.02)])
     wire.receive(READ, 10.0)
     received = timeline(wire, 11.0)
@@ -82,7 +82,7 @@ def test_simulated_rtu_reply_waits_t3_5_even_with_a_shorter_response_delay() -> 
     ],
     ids=lambda each: getattr(each, "model", None),
 )
-def test_the_silence_before_a_simulated_reply_is_that_of_its_family(
+def test_silence_before_a_simulated_reply_depends_on_the_family(
     drive: Drive, request_: str, silence: float
 ) -> None:
     wire = Wire([simulated(drive, response_delay=0.0)])
@@ -126,7 +126,7 @@ def test_simulated_drive_ignores_a_request_during_a_reply() -> None:
     assert sim.counters.requests == 1
 
 
-def test_early_request_is_counted_and_answered_unless_the_manual_forbids_it() -> None:
+def test_simulated_drive_answers_an_early_request_by_default() -> None:
     sim = SimulatedDrive(Own(1), response_delay=0.02)
     wire = Wire([sim])
     wire.receive(READ, 0.0)
@@ -135,7 +135,7 @@ def test_early_request_is_counted_and_answered_unless_the_manual_forbids_it() ->
     assert sim.counters.early == 1
 
 
-def test_reply_of_a_fast_drive_arrives_before_the_late_reply_of_a_slow_one() -> None:
+def test_fast_drive_replies_before_the_late_reply_of_a_slow_drive() -> None:
     slow, quick = SimulatedDrive(Own(1), response_delay=0.5), SimulatedDrive(Own(2), response_delay=0.01)
     slow["value"], quick["value"] = 1, 2
     wire = Wire([slow, quick])
@@ -185,7 +185,7 @@ def test_simulated_drives_with_three_framings_share_a_line() -> None:
         assert wire.advance(10.0) == reply
 
 
-def test_simulated_drive_receives_only_its_own_baud_rate() -> None:
+def test_simulated_drive_ignores_requests_at_another_baud_rate() -> None:
     slow, fast = Own(1, baudrate=9600), Own(2, baudrate=19200)
     wire = Wire([simulated(slow), simulated(fast)])
     other = checksums.rtu("02 03 00 01 00 01")
@@ -197,14 +197,14 @@ def test_simulated_drive_receives_only_its_own_baud_rate() -> None:
     assert exchange(wire, READ, 40.0, None) != b""
 
 
-def test_frame_is_discarded_if_the_baud_rate_changes_within_it() -> None:
+def test_incomplete_frame_is_discarded_when_the_baud_rate_changes() -> None:
     wire = Wire([simulated(Own(1, baudrate=9600))])
     wire.receive(READ[:4], 0.0, 9600)
     wire.receive(b"", 0.001, 19200)
     assert exchange(wire, READ, 0.002, 9600) != b""
 
 
-def test_a_broadcast_changes_simulated_drives_of_its_framing_without_a_reply() -> None:
+def test_broadcast_changes_only_simulated_drives_of_the_same_framing() -> None:
     sims = [
         simulated(Own(address, framing=framing))
         for address, framing in ((1, "rtu"), (2, "rtu"), (3, "ascii"))
@@ -281,14 +281,14 @@ def test_frame_received_in_chunks_without_a_pause_is_one_frame() -> None:
     assert frame.end == pytest.approx(10.013)
 
 
-def test_end_of_a_frame_that_arrives_too_fast_is_computed_from_the_baud_rate() -> None:
+def test_end_time_of_a_frame_is_computed_from_the_baud_rate() -> None:
     receiver = receiver_rtu()
     receiver.feed(WRITE[:5], 10.0)
     (frame,) = receiver.feed(WRITE[5:], 10.001)
     assert frame.end == pytest.approx(10.013)
 
 
-def test_pause_within_a_frame_damages_it() -> None:
+def test_frame_with_a_pause_inside_is_not_received() -> None:
     receiver = receiver_rtu()
     receiver.feed(READ_FRAME[:4], 10.0)
     assert functions(receiver.feed(READ_FRAME[4:], 10.004 + GAP + 1e-4)) == []
@@ -319,13 +319,13 @@ def test_valid_frame_followed_by_other_bytes_is_not_a_request(extra: bytes) -> N
     assert functions(receiver.feed(READ_FRAME, 2.0)) == [3]
 
 
-def test_request_in_chunks_after_another_request_leaves_both_intact() -> None:
+def test_two_requests_are_received_if_the_second_arrives_in_chunks() -> None:
     receiver = receiver_rtu()
     assert receiver.feed(READ_FRAME + WRITE[:5], 0.0) == []
     assert functions(receiver.feed(WRITE[5:], 0.013)) == [3, 16]
 
 
-def test_valid_request_inside_a_longer_request_is_not_a_request() -> None:
+def test_valid_frame_inside_a_longer_request_is_not_received_separately() -> None:
     """A long frame contains a valid request. Its first chunk ends some bytes after that request."""
     whole = checksums.rtu(bytes.fromhex("01 10 00 00 00 0C 18") + READ_FRAME + bytes(16))
     receiver = receiver_rtu()
@@ -353,7 +353,7 @@ def test_frame_with_an_unknown_function_ends_with_silence() -> None:
 
 
 @table(("framing", "text"), [(Framing.ASCII, RUN), (Framing.DELIXI, NATIVE)])
-def test_ascii_or_delixi_frame_is_complete_at_its_line_end(framing: Framing, text: bytes) -> None:
+def test_ascii_or_delixi_frame_is_complete_after_its_line_ending(framing: Framing, text: bytes) -> None:
     receiver = Receiver(framing, CHARACTER, 1.0)
     assert receiver.feed(text[:7], 0.0) == []
     (frame,) = receiver.feed(text[7:], 0.5)
@@ -377,7 +377,7 @@ def test_incomplete_text_frames_are_ignored(text: bytes) -> None:
 
 @pytest.mark.slow
 @table("framing", list(Framing))
-def test_random_bytes_neither_raise_nor_exceed_the_buffer_limit(framing: Framing) -> None:
+def test_receiver_buffer_stays_limited_for_random_bytes(framing: Framing) -> None:
     randomness = random.Random(1)
     good = {Framing.RTU: READ_FRAME, Framing.ASCII: RUN, Framing.DELIXI: NATIVE, Framing.TCP: OVER_TCP}[
         framing

@@ -23,7 +23,7 @@ def is_near(baudrate: int, wanted: int) -> bool:
 
 @pytest.mark.slow
 @USB
-def test_the_kernel_and_the_adapter_use_the_requested_port_settings(guest: Guest, kind: str) -> None:
+def test_requested_port_settings_reach_the_kernel_and_the_adapter(guest: Guest, kind: str) -> None:
     facts = guest.run("settings", kind=kind, wanted=SETTINGS)
     for (baudrate, form), fact in zip(SETTINGS, facts, strict=True):
         assert fact["read"] == RIGHT
@@ -33,7 +33,7 @@ def test_the_kernel_and_the_adapter_use_the_requested_port_settings(guest: Guest
 
 
 @pytest.mark.slow
-def test_a_baud_rate_that_the_adapter_does_not_have_is_refused(guest: Guest) -> None:
+def test_baud_rate_that_the_adapter_does_not_support_is_refused(guest: Guest) -> None:
     (fact,) = guest.run("settings", kind="cp210x", wanted=[(12345, "8E1")])
     assert "does not take the baud rate" in fact["read"]
 
@@ -49,7 +49,7 @@ def test_failed_usb_transfers_lose_no_reply(guest: Guest, kind: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.long
-def test_doctor_advises_only_settings_that_the_driver_has(guest: Guest) -> None:
+def test_doctor_suggests_only_settings_that_the_driver_supports(guest: Guest) -> None:
     """Only ftdi_sio has a latency timer and needs low latency. No driver has an RS-485 mode."""
     found = guest.run("doctor")
     assert found.keys() == {*KINDS, "8250"}
@@ -82,7 +82,7 @@ def test_scan_and_doctor_name_an_adapter_by_its_serial_number(guest: Guest) -> N
 
 
 @pytest.mark.slow
-def test_error_for_a_port_that_cannot_be_opened_gives_the_reason(guest: Guest) -> None:
+def test_error_names_the_reason_if_a_port_cannot_be_opened(guest: Guest) -> None:
     found = guest.run("refused_ports") | guest.run("absent_uart")
     for name, reason in {
         "locked": "in use by this or another program",
@@ -152,7 +152,7 @@ def test_rts_stays_until_the_last_bit_has_left(guest: Guest, kind: str, baudrate
 @pytest.mark.slow
 @pytest.mark.long
 @USB
-def test_rts_is_lowered_although_the_adapter_accepts_no_bytes(guest: Guest, kind: str) -> None:
+def test_rts_is_lowered_while_a_stalled_adapter_accepts_no_bytes(guest: Guest, kind: str) -> None:
     """Otherwise the transceiver would block the line. Closing the port then discards the request."""
     found = guest.run("rts_in_stall", kind=kind)
     assert any("stalled: its adapter takes no bytes" in result for result in found["results"])
@@ -242,7 +242,7 @@ SIGNALS = [*((kind, signal.SIGINT) for kind in KINDS), *((kind, signal.SIGTERM) 
 @pytest.mark.slow
 @pytest.mark.long
 @USB
-def test_an_unsent_start_command_is_discarded_when_a_stalled_port_closes(guest: Guest, kind: str) -> None:
+def test_closing_a_stalled_port_discards_an_unsent_start_command(guest: Guest, kind: str) -> None:
     """The driver of this adapter would wait for ever. `close` waits once, for less than a second."""
     found = guest.run("start_in_stall", kind=kind)
     assert len(found["waits"]) <= 1

@@ -29,7 +29,7 @@ def check_recovered(found: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("kinds", [["ftdi", "acm"], pytest.param(KINDS, marks=pytest.mark.long)])
-def test_unplugged_adapters_are_polled_again_when_they_are_back(guest: Guest, kinds: list[str]) -> None:
+def test_polling_continues_when_unplugged_adapters_are_back(guest: Guest, kinds: list[str]) -> None:
     found = guest.run("poll_through_unplug", kinds=kinds, names="path")
     check_recovered(found)
     assert found["statuses"].keys() == set(kinds)
@@ -38,7 +38,7 @@ def test_unplugged_adapters_are_polled_again_when_they_are_back(guest: Guest, ki
 
 
 @pytest.mark.long
-def test_only_the_stop_is_sent_when_an_unplugged_adapter_is_back(guest: Guest) -> None:
+def test_only_the_stop_is_sent_after_an_adapter_is_plugged_in_again(guest: Guest) -> None:
     found = guest.run("commands_while_unplugged", kind="ftdi")
     assert found["ended"]["start"].startswith("PortLost")
     assert found["ended"]["set_frequency"].startswith("PortLost")
@@ -51,7 +51,7 @@ def test_only_the_stop_is_sent_when_an_unplugged_adapter_is_back(guest: Guest) -
 
 @pytest.mark.long
 @pytest.mark.parametrize("names", ["path", "by_id", "by_path"])
-def test_adapters_that_exchange_their_tty_names_are_distinguished(guest: Guest, names: str) -> None:
+def test_drives_are_not_confused_when_adapters_exchange_tty_names(guest: Guest, names: str) -> None:
     found = guest.run("changed_names", how=names)
     assert found["names after"] == found["names"][::-1]
     assert found["wrong"] == []
@@ -66,7 +66,9 @@ def test_adapters_that_exchange_their_tty_names_are_distinguished(guest: Guest, 
 @pytest.mark.parametrize(
     ("format", "kinds"), [("8E1", ["parity", "framing", "break"]), ("8N1", ["framing", "break"])]
 )
-def test_a_reply_with_an_error_flag_is_a_bad_reply(guest: Guest, format: str, kinds: list[str]) -> None:
+def test_reply_marked_by_the_driver_as_damaged_raises_bad_reply(
+    guest: Guest, format: str, kinds: list[str]
+) -> None:
     found = guest.run("damaged_replies", format=format, kinds=kinds)
     for kind in kinds:
         assert found[kind].startswith("BadReply"), kind
@@ -97,7 +99,7 @@ def test_an_adapter_moved_to_another_usb_socket_is_polled_again(guest: Guest) ->
 
 
 @pytest.mark.long
-def test_an_adapter_without_serial_number_is_identified_by_its_usb_socket(guest: Guest) -> None:
+def test_adapter_without_serial_number_is_identified_by_the_usb_socket(guest: Guest) -> None:
     found = guest.run("other_socket", is_anonymous=True, names="by_path")
     check_recovered(found)
     assert not found["elsewhere"]
@@ -118,7 +120,7 @@ def test_a_reset_adapter_is_polled_again(guest: Guest, kind: str, names: str) ->
 
 
 @pytest.mark.long
-def test_a_start_is_sent_at_most_once_if_its_adapter_is_reset_meanwhile(guest: Guest) -> None:
+def test_start_is_sent_at_most_once_if_the_adapter_is_reset(guest: Guest) -> None:
     delays = [0.0, 0.01, 0.02, 0.03, 0.05, 0.1, 0.2, 1.0]  # a busy computer needs long for a start
     facts = guest.run("reset_in_start", kind="ftdi", delays=delays)
     for fact in facts:

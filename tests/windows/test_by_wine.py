@@ -298,7 +298,9 @@ def test_ctrl_c_during_a_start_reports_sent_frames(wine: Wine, pump: MotorDrive,
 
 
 @pytest.mark.parametrize("name", ["COM5", "com5", r"\\.\COM5", "COM10", "com10", r"\\.\COM10"])
-def test_a_port_can_be_opened_by_each_of_its_names(wine: Wine, pump: MotorDrive, name: str) -> None:
+def test_windows_port_can_be_opened_by_any_spelling_of_its_name(
+    wine: Wine, pump: MotorDrive, name: str
+) -> None:
     wine.link("com10", wine.terminal_of("com5"))
     ran = wine.run("-m", "multidrop", "state", name, "invt-che", 1)
     assert ran.returncode == 0, ran.stderr
@@ -315,20 +317,22 @@ def test_invalid_port_prints_one_sentence(wine: Wine, name: str, reason: str) ->
     assert reason in sentence
 
 
-def test_output_to_a_pipe_escapes_letters_outside_its_encoding(wine: Wine, plant: Path) -> None:
+def test_piped_output_escapes_letters_outside_the_encoding(wine: Wine, plant: Path) -> None:
     ran = wine.run("-m", "multidrop", "plan", plant)
     assert ran.returncode == 0, ran.stderr
     assert rb"\u043d\u0430\u0441\u043e\u0441" in ran.stdout
 
 
-def test_console_prints_all_letters(wine: Wine, plant: Path) -> None:
+def test_windows_console_prints_cyrillic_drive_names(wine: Wine, plant: Path) -> None:
     with wine.console("-m", "multidrop", "plan", plant) as console:
         assert console.status() == 0
         console.until_said("насос")
 
 
 @pytest.mark.parametrize("form", ["8E1", "8O1", "8N2"])
-def test_a_windows_port_accepts_parity_and_stop_bits(wine: Wine, pump: MotorDrive, form: str) -> None:
+def test_windows_port_can_be_opened_with_parity_or_two_stop_bits(
+    wine: Wine, pump: MotorDrive, form: str
+) -> None:
     """Check only that the port accepts both settings, because a pseudo-terminal does not use them."""
     ran = wine.run("-m", "multidrop", "state", "COM5", "invt-che", 1, "--format", form)
     assert ran.returncode == 0, ran.stderr
@@ -345,7 +349,9 @@ OPEN = "from multidrop import Bus\nBus('COM5', rs485={!r})"
         ("kernel", "has no RS-485 mode"),
     ],
 )
-def test_terminal_without_rts_is_not_opened(wine: Wine, pump: MotorDrive, mode: str, reason: str) -> None:
+def test_rts_modes_are_refused_on_a_port_without_rts(
+    wine: Wine, pump: MotorDrive, mode: str, reason: str
+) -> None:
     ran = wine.run("-c", OPEN.format(mode))
     assert ran.returncode == 1
     sentence = ran.stderr.decode().splitlines()[-1]
@@ -368,7 +374,7 @@ def test_recording_of_a_killed_poll_is_readable(wine: Wine, pump: MotorDrive, pl
     assert "ok" in statuses(later)
 
 
-def test_a_port_that_vanished_is_polled_again_when_it_comes_back(wine: Wine, plant: Path) -> None:
+def test_polling_continues_when_a_vanished_port_comes_back(wine: Wine, plant: Path) -> None:
     out = plant.with_name("rows.arrows")
     with ExitStack() as stack:
         cable = stack.enter_context(ExitStack())

@@ -189,7 +189,7 @@ async def _lost(fleet: Fleet) -> None:
 
 
 @pytest.mark.parametrize("deed", [_moved, _moved_back, _died, _lost])
-def test_a_command_is_not_sent_if_its_line_changed_masters_before_confirmation(
+def test_command_is_not_sent_if_the_line_changed_masters_after_the_offer(
     tell: Callable[[Story], None], deed: Callable[[Fleet], Awaitable[None]]
 ) -> None:
     async def story(fleet: Fleet) -> None:
@@ -202,7 +202,7 @@ def test_a_command_is_not_sent_if_its_line_changed_masters_before_confirmation(
     tell(story)
 
 
-def test_a_command_is_carried_out_once_although_its_confirmation_is_repeated(
+def test_command_is_carried_out_once_if_the_confirmation_is_repeated(
     tell: Callable[[Story], None],
 ) -> None:
     async def story(fleet: Fleet) -> None:
@@ -314,7 +314,7 @@ def test_the_fleet_command_line_can_write_a_setpoint_and_stop_a_drive(drill: Com
     assert all(got >= asked for got, asked in zip(stops, (3, 2, 1, 1), strict=True)), stops
 
 
-def test_80_commands_are_carried_out_once_and_get_true_answers(drill: CommandDrill) -> None:
+def test_each_of_80_commands_is_carried_out_at_most_once(drill: CommandDrill) -> None:
     """The long version of this test is `python -m bench.questions.fleet.commands --commands 6000`."""
     before = {drive: drill.setpoints(drive) for drive in drill.sims}
     found = asyncio.run(drill.ask(80, 10.0))
@@ -380,7 +380,9 @@ async def nobody_is_asked(asker: Client) -> bool:
         return False
 
 
-async def test_servers_report_that_no_gateway_polls_a_line(servers: SecuredCluster, tmp_path: Path) -> None:
+async def test_servers_report_a_missing_gateway_to_a_commander(
+    servers: SecuredCluster, tmp_path: Path
+) -> None:
     """Servers report a missing gateway although the commander and gateways are in different NATS accounts."""
     with desks(tmp_path) as made:
         async with asyncio.timeout(PATIENCE_S), commanded(servers, made) as subjects:

@@ -73,7 +73,7 @@ async def test_a_command_is_logged_before_and_after_it_is_carried_out(desk: Desk
     assert (frame["by"], frame["way"]) == ("anna", "fleet")
 
 
-async def test_a_command_that_is_confirmed_several_times_is_sent_once(desk: Desks) -> None:
+async def test_command_is_sent_once_if_confirmed_several_times(desk: Desks) -> None:
     token = desk.offered()
     answers = await asyncio.gather(*(desk.do(token) for _ in range(5)))
     desk.clock.pass_s(100)
@@ -114,7 +114,7 @@ async def do_after(desk: Desks, deed: Callable[[], object], waited_s: float = 0.
 
 
 @patient
-async def test_a_command_whose_thread_is_slow_is_not_sent_after_a_second(tmp_path: Path) -> None:
+async def test_command_is_not_sent_if_a_slow_thread_exceeds_one_second(tmp_path: Path) -> None:
     """A command must be sent within a second of its offer. The bus waits only for the rest of this second."""
     with desks(tmp_path, patience_s=0) as desk:
         answer = await do_after(desk, lambda: time.sleep(0.2), waited_s=0.95)
@@ -123,7 +123,7 @@ async def test_a_command_whose_thread_is_slow_is_not_sent_after_a_second(tmp_pat
         assert desk.writes == []
 
 
-async def test_a_stop_cancels_a_confirmed_command_that_is_not_sent_yet(desk: Desks) -> None:
+async def test_stop_cancels_a_confirmed_but_unsent_command(desk: Desks) -> None:
     """Right before it sends a command, the bus checks again whether a stop has cancelled the offer."""
     answer = await do_after(desk, lambda: desk.desk.offers.void(LINE, ["pump"], "a stop was called"))
     assert answer.outcome is NOT_SENT
@@ -173,9 +173,7 @@ MEANWHILE: dict[str, Callable[[Desks], object]] = {
 
 @pytest.mark.parametrize("deed", MEANWHILE)
 @pytest.mark.parametrize("is_late", [False, True])
-async def test_a_command_that_was_cancelled_before_its_write_is_not_sent(
-    desk: Desks, deed: str, is_late: bool
-) -> None:
+async def test_cancelled_command_is_not_sent(desk: Desks, deed: str, is_late: bool) -> None:
     """The command is cancelled before its sender confirms it, or between the confirmation and the write."""
     if is_late:
         answer = await while_noted(desk, lambda: MEANWHILE[deed](desk))
@@ -281,7 +279,9 @@ LOSSES: dict[str, Callable[[Desks], object]] = {
 
 
 @pytest.mark.parametrize("loss", LOSSES)
-def test_a_stop_of_a_lost_line_has_no_answer(desk: Desks, monkeypatch: pytest.MonkeyPatch, loss: str) -> None:
+def test_gateway_does_not_answer_a_stop_after_losing_the_line(
+    desk: Desks, monkeypatch: pytest.MonkeyPatch, loss: str
+) -> None:
     """The line's next master gets a copy of the stop, and answers it."""
 
     def lost(seconds: float | None) -> dict[str, Stopped]:
@@ -298,7 +298,7 @@ def test_a_stop_of_a_lost_line_has_no_answer(desk: Desks, monkeypatch: pytest.Mo
     assert desk.written == {"control"}
 
 
-async def test_a_repeated_stop_message_causes_one_stop_and_cancels_waiting_commands(desk: Desks) -> None:
+async def test_copies_of_a_stop_message_cause_only_one_stop(desk: Desks) -> None:
     token = desk.offered()
     copies = await asyncio.gather(*(desk.stop(id="one") for _ in range(3)))
     assert len({copy.text for copy in copies if copy}) == 1
@@ -465,7 +465,7 @@ def test_a_stop_with_a_new_id_is_a_new_stop(desk: Desks, first: dict[str, Any], 
     assert len(desk.writes) == before + 1
 
 
-async def test_a_stop_that_names_an_unknown_drive_still_stops_the_known_drives(desk: Desks) -> None:
+async def test_known_drives_stop_even_if_the_stop_names_an_unknown_drive(desk: Desks) -> None:
     answer = await desk.stop(drives=["pump", "fan"])
     assert answer.outcome is REFUSED
     assert {name: one.outcome for name, one in answer.drives.items()} == {"pump": DONE, "fan": REFUSED}
@@ -485,12 +485,12 @@ async def test_only_stops_accept_another_unicode_form_of_a_drives_name(tmp_path:
 
 
 @table("data", [b"", b"[]", b'{"outcome": "maybe", "text": ""}', b'{"outcome": "done"}'])
-def test_a_sender_rejects_invalid_answers(data: bytes) -> None:
+def test_invalid_answer_to_a_command_raises_value_error(data: bytes) -> None:
     with pytest.raises(ValueError, match=r"is not|must be"):
         read_answer(data) if data.startswith((b"{", b"[")) else read_offer(data)
 
 
-def test_a_command_to_a_drive_that_has_left_its_line_is_not_sent() -> None:
+def test_command_is_not_sent_to_a_drive_without_a_line() -> None:
     drive = InvtCHE(1, name="mill", maximum_frequency=50)
     for request in (
         CommandRequest("1", "anna", "mill", register="setpoint", value=10.0),
@@ -501,7 +501,7 @@ def test_a_command_to_a_drive_that_has_left_its_line_is_not_sent() -> None:
         assert answer.text.startswith("mill is ")
 
 
-def test_the_check_of_a_command_does_not_change_the_known_setpoint() -> None:
+def test_checking_a_command_does_not_change_the_stored_setpoint() -> None:
     """A checked command may never be sent. A changed setpoint would affect the next start."""
     drive = InvtCHE(1, name="mill", maximum_frequency=50)
     drive.commanded = 40.0
@@ -510,7 +510,7 @@ def test_the_check_of_a_command_does_not_change_the_known_setpoint() -> None:
 
 
 @pytest.mark.long
-async def test_a_stop_that_joins_a_running_stop_cancels_waiting_commands_immediately(
+async def test_stop_cancels_waiting_commands_even_beyond_the_limit_of_stops(
     desk: Desks, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     begun, silent = list[str](), asyncio.Event()
@@ -578,7 +578,7 @@ async def test_a_failed_log_thread_blocks_commands_but_not_stops(tmp_path: Path)
         assert desk.written == {"control"}
 
 
-async def test_log_records_keep_their_order_and_are_refused_after_the_close(tmp_path: Path) -> None:
+async def test_command_log_keeps_records_in_order_until_closed(tmp_path: Path) -> None:
     log = CommandLog(tmp_path / "commands.jsonl")
     await asyncio.gather(*(log.note({"step": number}) for number in range(5)))
     log.close()
@@ -588,7 +588,7 @@ async def test_log_records_keep_their_order_and_are_refused_after_the_close(tmp_
     assert [line.partition('"step": ')[2] for line in lines] == ["0}", "1}", "2}", "3}", "4}"]
 
 
-async def test_a_command_log_refuses_records_if_too_many_wait_for_the_disk(
+async def test_command_log_refuses_records_while_too_many_wait_for_the_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     disk, log = threading.Event(), CommandLog(tmp_path / "commands.jsonl")
@@ -619,7 +619,7 @@ def test_a_hanging_disk_or_port_does_not_block_the_gateways_exit(tmp_path: Path,
 
 
 @pytest.mark.slow
-def test_only_one_of_many_stops_is_repeated(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_simultaneous_stops_share_one_repeated_stop(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Eight stops arrive while the first is being repeated. All nine get the result of a repeated stop."""
     repeated: list[float | None] = []
 

@@ -148,7 +148,7 @@ WRITES: dict[str, tuple[ScriptedPath, CommandOutcome, int]] = {
 
 
 @pytest.mark.parametrize("case", WRITES)
-def test_a_command_is_sent_once_and_its_real_outcome_is_reported(tmp_path: Path, case: str) -> None:
+def test_write_command_reports_the_true_outcome(tmp_path: Path, case: str) -> None:
     path, outcome, sent = WRITES[case]
     told = asked(tmp_path, path, write)
     assert told.outcome is outcome
@@ -218,7 +218,7 @@ def test_progress_of_a_stop_is_reported_once_per_change(tmp_path: Path) -> None:
     assert last.outcome is DONE
 
 
-def test_a_stop_reports_immediately_and_once_that_its_line_has_no_master(tmp_path: Path) -> None:
+def test_stop_reports_a_missing_master_once(tmp_path: Path) -> None:
     told: list[CommandAnswer] = []
     path = ScriptedPath(stop=[NOBODY, NOBODY, CUT, IT_IS_DONE])
     last = asked(tmp_path, path, lambda client: client.stop(["pump-1"], on_news=told.append), nobody_s=60.0)
@@ -230,7 +230,7 @@ def test_a_stop_reports_immediately_and_once_that_its_line_has_no_master(tmp_pat
     ]
 
 
-def test_a_stop_whose_gateway_falls_silent_reports_its_last_answer(tmp_path: Path) -> None:
+def test_stop_reports_the_last_answer_if_the_gateway_falls_silent(tmp_path: Path) -> None:
     path = ScriptedPath(
         stop=[{**answer("under way", "pump-1: the stop was sent"), "gateway": "gw-1"}, NOBODY]
     )
@@ -239,7 +239,7 @@ def test_a_stop_whose_gateway_falls_silent_reports_its_last_answer(tmp_path: Pat
     assert last.text.endswith("; its last answer: pump-1: the stop was sent")
 
 
-def test_a_stop_without_answers_is_reported_before_the_client_gives_up(tmp_path: Path) -> None:
+def test_unanswered_stop_is_reported_before_the_client_gives_up(tmp_path: Path) -> None:
     told: list[CommandAnswer] = []
     path = ScriptedPath(stop=[LOST])
     last = asked(tmp_path, path, lambda client: client.stop(["pump-1"], on_news=told.append))
@@ -269,7 +269,7 @@ def test_a_stop_does_not_wait_for_a_hanging_server(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("others", [[NOBODY, NOBODY], [NOBODY, CUT], [LOST, NOBODY]])
-def test_a_stop_counts_as_not_sent_only_if_all_servers_say_so(tmp_path: Path, others: list[Given]) -> None:
+def test_stop_outcome_is_unknown_only_if_an_answer_is_lost(tmp_path: Path, others: list[Given]) -> None:
     paths = [ScriptedPath(stop=[given]) for given in (NOBODY, *others)]
 
     async def stop_on_all(client: FleetCommands) -> CommandAnswer:
@@ -315,7 +315,7 @@ def test_a_hanging_disk_blocks_commands_but_no_stop(tmp_path: Path, monkeypatch:
     assert path.asked == ["stop"] * 2
 
 
-def test_a_log_that_cannot_be_opened_blocks_commands_but_not_stops(tmp_path: Path) -> None:
+def test_unopenable_log_blocks_commands_but_not_stops(tmp_path: Path) -> None:
     path = ScriptedPath(cmd=[OFFER], do=[IT_IS_DONE], stop=[IT_IS_DONE])
     (tmp_path / "asked.jsonl").mkdir()
     told = asked(tmp_path, path, write)
@@ -325,7 +325,7 @@ def test_a_log_that_cannot_be_opened_blocks_commands_but_not_stops(tmp_path: Pat
     assert path.asked == ["stop"]
 
 
-def test_a_command_whose_preview_has_changed_is_not_sent(tmp_path: Path) -> None:
+def test_command_is_not_sent_if_the_preview_has_changed(tmp_path: Path) -> None:
     path = ScriptedPath(cmd=[OFFER], do=[IT_IS_DONE])
 
     async def agreed(client: FleetCommands) -> CommandAnswer:
@@ -338,7 +338,7 @@ def test_a_command_whose_preview_has_changed_is_not_sent(tmp_path: Path) -> None
     assert path.asked == ["cmd"]
 
 
-def test_all_lines_are_stopped_and_the_worst_outcome_is_returned(tmp_path: Path) -> None:
+def test_stop_of_all_lines_returns_the_worst_outcome(tmp_path: Path) -> None:
     path = ScriptedPath(stop=[{**IT_IS_DONE, "drives": {"pump-1": IT_IS_DONE}}, NOBODY])
     told = asked(tmp_path, path, lambda client: client.stop())
     assert told.outcome is NOT_SENT
@@ -368,7 +368,7 @@ def test_only_stops_accept_another_unicode_form_of_a_drives_name(tmp_path: Path)
 @pytest.mark.parametrize(
     ("by", "noted"), [("\x1b[31m", r"\x1b[31m"), ("\ud800", r"\ud800"), ("", "somebody"), (None, "somebody")]
 )
-def test_a_stop_is_sent_even_if_its_senders_name_is_invalid(tmp_path: Path, by: Any, noted: str) -> None:
+def test_stop_is_sent_even_if_the_sender_name_is_invalid(tmp_path: Path, by: Any, noted: str) -> None:
     path = ScriptedPath(stop=[IT_IS_DONE])
 
     async def stopped(client: FleetCommands) -> CommandAnswer:
@@ -395,7 +395,7 @@ def test_a_client_uses_its_older_copy_of_the_plant_if_reading_fails(tmp_path: Pa
     assert asked(tmp_path, path, stop, plant).outcome is DONE
 
 
-def test_a_stop_of_a_named_line_is_sent_although_the_plant_cannot_be_read(tmp_path: Path) -> None:
+def test_stop_of_a_named_line_needs_no_readable_plant(tmp_path: Path) -> None:
     path = ScriptedPath(stop=[IT_IS_DONE])
     plant = Plant(FleetError("no server"))
     told = asked(tmp_path, path, lambda client: client.stop(["pump-1"], line="hall-1"), plant)
@@ -406,7 +406,7 @@ def test_a_stop_of_a_named_line_is_sent_although_the_plant_cannot_be_read(tmp_pa
         asked(tmp_path, path, stop, plant)
 
 
-def test_an_unknown_drive_does_not_prevent_the_stops_of_known_drives(tmp_path: Path) -> None:
+def test_known_drives_are_stopped_despite_an_unknown_drive_name(tmp_path: Path) -> None:
     path = ScriptedPath(stop=[{**IT_IS_DONE, "drives": {"pump-1": IT_IS_DONE}}])
     told = asked(tmp_path, path, lambda client: client.stop(["pmp-2", "pump-1"]))
     assert path.asked == ["stop"]

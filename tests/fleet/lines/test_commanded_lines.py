@@ -82,7 +82,7 @@ async def settled(subjects: CommandSubjects) -> None:
     await asyncio.gather(*supervisor().started)
 
 
-async def test_a_gateway_answers_stops_of_a_closing_line_until_it_is_closed(desk: Desks) -> None:
+async def test_gateway_answers_stops_while_a_line_is_closing(desk: Desks) -> None:
     path, lines = HeardPath(), SlowLines()
     subjects = CommandSubjects("gw-1", [path], desk.lines, desk.log)
     commanded = CommandedLines(lines, subjects)
@@ -106,7 +106,7 @@ async def test_a_gateway_answers_stops_of_a_closing_line_until_it_is_closed(desk
     assert desk.written == {"control"}
 
 
-async def test_a_stop_is_answered_only_on_a_reply_subject_of_nats(desk: Desks) -> None:
+async def test_stop_is_answered_only_on_nats_inbox_subjects(desk: Desks) -> None:
     """If a requester names a plant record's subject for the answer, the answer would replace the record."""
     answered: list[str] = []
 
@@ -129,7 +129,7 @@ async def test_a_stop_is_answered_only_on_a_reply_subject_of_nats(desk: Desks) -
 
 
 @pytest.mark.parametrize("may_wait", [True, False])
-async def test_closing_a_line_waits_for_its_running_command_if_the_lease_allows(
+async def test_closing_a_line_waits_for_the_running_command_if_allowed(
     desk: Desks, monkeypatch: pytest.MonkeyPatch, may_wait: bool
 ) -> None:
     """The sender must get the command's result before the line is closed."""
@@ -181,7 +181,9 @@ class ClosedLines(SlowLines):
 
 
 @pytest.mark.parametrize("drives", [None, ["pump"]])
-async def test_a_stop_on_a_closed_bus_is_not_answered(desk: Desks, drives: list[str] | None) -> None:
+async def test_gateway_does_not_answer_a_stop_if_the_bus_is_closed(
+    desk: Desks, drives: list[str] | None
+) -> None:
     """If this gateway refused the stop, the sender would not try another gateway."""
 
     lines = ClosedLines(desk.bus.close)
@@ -325,7 +327,7 @@ def test_no_row_is_lost_when_a_line_moves_between_gateways(tmp_path: Path, gatew
     assert [(one.lost, one.doubled) for one in judged] == [(0, 0), (0, 0)]
 
 
-def test_a_request_abandoned_at_the_end_of_polling_has_status_poll_ended(
+def test_unanswered_request_has_status_poll_ended_after_polling_ends(
     tmp_path: Path, gateways: list[Gateway], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("multidrop.polling.line_set.ENDING_NS", 0)

@@ -75,7 +75,7 @@ async def watched() -> tuple[Trial, Lease, Observer]:
     return trial, lease, observer
 
 
-async def test_a_new_lease_counts_from_the_sending_of_the_request() -> None:
+async def test_new_lease_starts_when_the_request_is_sent() -> None:
     trial = Trial()
     for bucket in trial.buckets:
         bucket.before_put = lambda key: trial.clock.pass_s(0.25)  # the request takes 0.25 s
@@ -87,7 +87,7 @@ async def test_a_new_lease_counts_from_the_sending_of_the_request() -> None:
     assert trial.masterships[0].until == lease.until
 
 
-async def test_a_renewed_lease_counts_from_the_sending_of_the_request() -> None:
+async def test_renewed_lease_starts_when_the_renewal_is_sent() -> None:
     trial, lease = await begun()
     trial.clock.pass_s(1)
     sent = trial.clock.now
@@ -98,7 +98,7 @@ async def test_a_renewed_lease_counts_from_the_sending_of_the_request() -> None:
     assert lease.until == trial.masterships[0].until == sent + USUAL.lease
 
 
-async def test_a_lease_record_whose_write_got_no_answer_counts_after_its_renewal() -> None:
+async def test_unanswered_lease_record_counts_after_the_next_renewal() -> None:
     """The answer to a request was lost, so the lease does not know which request wrote the lease record."""
     trial = Trial()
     trial.buckets[2].loses_answers = True
@@ -115,7 +115,7 @@ async def test_a_lease_record_whose_write_got_no_answer_counts_after_its_renewal
     assert lease.until == began + 1.5 * SECOND + USUAL.lease
 
 
-async def test_the_lease_counts_from_the_second_newest_of_its_three_renewals() -> None:
+async def test_lease_counts_from_the_second_newest_of_three_renewals() -> None:
     trial, lease = await begun()
     began = trial.clock.now
     trial.clock.pass_s(1)
@@ -126,7 +126,7 @@ async def test_the_lease_counts_from_the_second_newest_of_its_three_renewals() -
     assert lease.until == began + SECOND + USUAL.lease
 
 
-async def test_the_lease_survives_one_lost_server_but_not_two() -> None:
+async def test_lease_remains_valid_while_one_of_three_servers_is_down() -> None:
     trial, lease = await begun()
     trial.buckets[1].is_down = True
     for _ in range(20):
@@ -200,7 +200,7 @@ async def test_a_late_answer_to_an_earlier_session_does_not_extend_the_lease() -
     assert not lease.is_valid
 
 
-async def test_a_session_ends_even_if_its_last_renewal_is_stored_late() -> None:
+async def test_session_ends_even_if_the_last_renewal_is_stored_late() -> None:
     """If the late renewal prevented the end, other gateways would wait until the lease expires."""
     trial, lease = await begun()
     for bucket, value in zip(trial.buckets, trial.values(), strict=True):
@@ -211,7 +211,7 @@ async def test_a_session_ends_even_if_its_last_renewal_is_stored_late() -> None:
 
 
 @pytest.mark.parametrize("later", [{"nonce": "another's"}, {"ended": True, "by": "b"}])
-async def test_the_end_of_a_session_replaces_only_records_of_that_session(later: dict[str, Any]) -> None:
+async def test_ending_a_session_keeps_records_written_by_others(later: dict[str, Any]) -> None:
     trial, lease = await begun()
     trial.buckets[0].store("a", {**trial.values()[0], **later})
     await lease.end()
@@ -260,7 +260,7 @@ async def test_a_late_answer_to_an_ended_session_does_not_extend_the_next_sessio
     assert lease.held[2] is None
 
 
-async def test_a_process_suspended_before_it_sets_the_timer_survives() -> None:
+async def test_lease_is_invalid_if_the_timer_deadline_has_already_passed() -> None:
     """The engine refuses a timer whose deadline has passed, because it would kill the process."""
 
     class StandingStill(RecordingMastership):
@@ -344,7 +344,7 @@ async def test_no_session_starts_if_only_one_lease_record_is_free() -> None:
     assert first.is_valid
 
 
-async def test_at_most_one_session_is_valid_if_two_processes_start_it() -> None:
+async def test_only_one_of_two_simultaneous_sessions_is_valid() -> None:
     trial = Trial()
     first, second = trial.lease(), trial.lease()
     begun = await asyncio.gather(first.try_to_begin(), second.try_to_begin())
@@ -376,7 +376,7 @@ async def test_a_starting_session_replaces_no_record_of_a_living_session() -> No
     assert not second.is_valid
 
 
-async def test_a_released_lock_file_proves_that_a_process_died(
+async def test_released_lock_file_shows_that_the_process_died(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(leases, "machine_id", lambda: "this machine")
@@ -436,7 +436,9 @@ async def test_a_lock_of_another_boot_does_not_prove_that_a_process_died(
 
 
 @pytest.mark.parametrize("empty", [0, 1])
-def test_no_boot_id_means_no_machine_id(empty: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_machine_id_is_empty_without_a_boot_id(
+    empty: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     ids = (tmp_path / "machine-id", tmp_path / "boot_id")
     for path in ids:
         path.write_text("something\n", "utf-8")
@@ -448,7 +450,7 @@ def test_no_boot_id_means_no_machine_id(empty: int, tmp_path: Path, monkeypatch:
     assert leases.machine_id() == ""
 
 
-async def test_an_observer_ends_a_dead_session_when_its_own_clock_shows_the_expiry() -> None:
+async def test_observer_ends_a_dead_session_by_the_observers_own_clock() -> None:
     trial, _ = await begun()
     observer = trial.observer()
     trial.clock.pass_s(100)  # an observer that starts late cannot know when the lease record was written
@@ -463,7 +465,7 @@ async def test_an_observer_ends_a_dead_session_when_its_own_clock_shows_the_expi
 
 
 @pytest.mark.parametrize("has_rival", [False, True])
-async def test_the_end_of_a_dead_session_does_not_wait_for_a_leaderless_bucket(has_rival: bool) -> None:
+async def test_dead_session_is_ended_even_if_one_bucket_has_no_leader(has_rival: bool) -> None:
     """The server of the third lease record may have died with the gateway."""
     trial, _lease, observer = await watched()
     trial.pass_lease()
@@ -484,7 +486,7 @@ async def test_the_end_of_a_dead_session_does_not_wait_for_a_leaderless_bucket(h
     assert observer.is_over("a", 1)
 
 
-async def test_a_record_renewed_after_the_decision_to_end_it_is_kept() -> None:
+async def test_gateway_does_not_end_a_session_renewed_just_before_the_write() -> None:
     """The record is renewed between the decision and the write. Reading it in between makes no difference."""
     trial, lease, observer = await watched()
     trial.pass_lease()
@@ -501,7 +503,7 @@ async def test_a_record_renewed_after_the_decision_to_end_it_is_kept() -> None:
     assert not lease.is_over
 
 
-async def test_a_gateway_with_one_newly_renewed_lease_record_is_not_dead() -> None:
+async def test_one_renewed_lease_record_shows_that_a_gateway_is_alive() -> None:
     """The observer may decide before it has read the gateway's new records in all buckets."""
     trial, lease, observer = await watched()
     trial.pass_lease()
@@ -514,7 +516,7 @@ async def test_a_gateway_with_one_newly_renewed_lease_record_is_not_dead() -> No
     assert not await observer.end_the_dead()
 
 
-async def test_no_gateway_writes_the_end_of_its_own_expired_session() -> None:
+async def test_gateway_does_not_end_its_own_expired_session() -> None:
     """If it wrote its own end, other gateways would treat the session as over without waiting."""
     trial = Trial()
     lease, observer = trial.lease("b"), trial.observer("b")
@@ -526,7 +528,7 @@ async def test_no_gateway_writes_the_end_of_its_own_expired_session() -> None:
     assert not any(value["ended"] for value in trial.values("b"))
 
 
-async def test_a_gateway_that_was_cut_off_does_not_end_sessions_immediately() -> None:
+async def test_gateway_does_not_end_sessions_immediately_after_an_outage() -> None:
     """After an outage of the servers, gateways must not end each other's sessions."""
     trial, _lease, observer = await watched()
     trial.clock.pass_s(60)
@@ -540,7 +542,7 @@ async def test_a_gateway_that_was_cut_off_does_not_end_sessions_immediately() ->
     assert observer.is_over("a", 1)
 
 
-async def test_a_session_that_is_over_stays_over_after_an_outage() -> None:
+async def test_ended_session_stays_ended_after_an_outage() -> None:
     """No line may be assigned to a dead gateway after the outage."""
     trial, _lease, observer = await watched()
     trial.pass_lease()
@@ -562,7 +564,7 @@ async def test_a_session_that_is_over_stays_over_after_an_outage() -> None:
     assert observer.sessions().keys() == {"a"}
 
 
-async def test_a_session_ended_during_an_outage_counts_as_alive_for_one_lease() -> None:
+async def test_session_ended_during_an_outage_counts_as_alive_for_one_lease_period() -> None:
     """The gateway may have renewed its session, unseen, right before another gateway wrote the end."""
     trial, _lease, observer = await watched()
     await observer.end_the_dead()
@@ -592,7 +594,9 @@ async def test_look_returns_true_if_a_session_has_ended_or_has_expired() -> None
 
 
 @table(("since_s", "rests_s"), [(0.0, 0.1), (2.2, 0.1), (2.27, 0.03), (2.3, 0.1), (60.0, 0.1)])
-def test_the_observer_reads_again_when_a_lease_may_have_expired(since_s: float, rests_s: float) -> None:
+def test_observer_reads_lease_records_again_when_a_lease_may_have_expired(
+    since_s: float, rests_s: float
+) -> None:
     async def main() -> None:
         loop = asyncio.get_running_loop()
         trial = Trial()
@@ -608,7 +612,7 @@ def test_the_observer_reads_again_when_a_lease_may_have_expired(since_s: float, 
     run_controlled(main())
 
 
-async def test_an_observer_without_answers_counts_no_gateway_as_dead() -> None:
+async def test_observer_declares_no_gateway_dead_while_servers_are_silent() -> None:
     """The observer cannot read renewals while its server is suspended; gateways renew over other servers."""
     trial, _lease, observer = await watched()
     for bucket in trial.buckets:
@@ -627,7 +631,7 @@ async def test_an_observer_without_answers_counts_no_gateway_as_dead() -> None:
     assert observer.dead().keys() == {"a"}
 
 
-async def test_a_session_ended_by_another_gateway_is_over_when_its_lease_expires() -> None:
+async def test_session_ended_by_another_gateway_is_over_at_lease_expiry() -> None:
     """The end may be wrong: until the lease expires, the session's own gateway may still send."""
     trial = Trial()
     lease, observer, late = trial.lease(), trial.observer(), trial.observer("c")
@@ -657,7 +661,7 @@ async def test_a_session_is_over_immediately_if_its_own_gateway_ends_it() -> Non
     assert await trial.lease().try_to_begin()
 
 
-async def test_a_gateways_new_session_waits_if_another_gateway_ended_the_previous_one() -> None:
+async def test_new_session_waits_if_another_gateway_ended_the_previous_session() -> None:
     trial, lease = await begun()
     second = trial.lease()
     trial.store_ends()
@@ -667,7 +671,7 @@ async def test_a_gateways_new_session_waits_if_another_gateway_ended_the_previou
     assert await second.try_to_begin()
 
 
-async def test_a_session_with_only_one_expired_lease_record_is_not_ended() -> None:
+async def test_session_is_not_ended_if_only_one_lease_record_expired() -> None:
     """If its expired record were ended, the gateway could not renew it for the rest of the session."""
     trial, lease = await begun()
     observer = trial.observer()
@@ -712,7 +716,7 @@ async def test_a_session_with_only_two_valid_lease_records_is_reported_as_weak()
     assert (lease.is_weak, observer.weak()) == (False, [])
 
 
-async def test_a_missing_lease_record_is_written_when_its_bucket_answers_again() -> None:
+async def test_missing_lease_record_is_written_when_the_bucket_answers_again() -> None:
     trial = Trial()
     trial.buckets[2].is_down = True
     lease = trial.lease()
@@ -723,7 +727,7 @@ async def test_a_missing_lease_record_is_written_when_its_bucket_answers_again()
     assert lease.held[2] is not None
 
 
-async def test_a_dead_sessions_record_with_an_equal_session_number_is_replaced() -> None:
+async def test_new_session_replaces_a_dead_sessions_record_of_the_same_number() -> None:
     """Another process of this gateway left the record, and died before it had written a second record."""
     trial = Trial()
     trial.buckets[2].is_down = True
@@ -736,7 +740,7 @@ async def test_a_dead_sessions_record_with_an_equal_session_number_is_replaced()
     assert trial.values()[2]["nonce"] == trial.values()[0]["nonce"]
 
 
-async def test_a_session_notices_that_its_unconfirmed_lease_record_was_ended() -> None:
+async def test_session_notices_the_end_of_an_unconfirmed_lease_record() -> None:
     trial = Trial()
     trial.buckets[2].loses_answers = True
     lease = trial.lease()

@@ -172,7 +172,7 @@ async def test_lines_are_closed_half_a_second_before_the_lease_expires() -> None
     assert trial.lines.taken == set()
 
 
-async def test_tasks_that_are_delayed_until_the_lease_has_expired_do_nothing() -> None:
+async def test_delayed_claim_or_opening_does_nothing_after_the_lease_expired() -> None:
     trial = Trial()
     bucket = trial.buckets[0]
     writing = trial.keeper._owners._writing[bucket.name] = asyncio.Semaphore(0)
@@ -194,7 +194,7 @@ async def test_tasks_that_are_delayed_until_the_lease_has_expired_do_nothing() -
     assert trial.lines.taken == set()
 
 
-async def test_a_line_lost_while_waiting_to_be_opened_is_not_opened() -> None:
+async def test_line_is_not_opened_if_another_gateway_claims_it_first() -> None:
     trial = Trial()
     openings = trial.keeper._openings = asyncio.Semaphore(0)
     await trial.read_and_begin()
@@ -206,7 +206,7 @@ async def test_a_line_lost_while_waiting_to_be_opened_is_not_opened() -> None:
     assert trial.lines.taken == set()
 
 
-async def test_a_line_accepts_no_stops_after_it_was_closed_for_its_release() -> None:
+async def test_line_closed_for_release_accepts_no_stops() -> None:
     trial = await claimed()
     trial.keeper.releasing = {"hall"}
     await trial.reconcile()
@@ -214,7 +214,7 @@ async def test_a_line_accepts_no_stops_after_it_was_closed_for_its_release() -> 
     assert not trial.keeper.may_stop("hall")
 
 
-async def test_a_line_is_closed_before_it_is_released() -> None:
+async def test_gateway_closes_a_line_before_releasing_ownership() -> None:
     trial = await claimed()
     trial.keeper.releasing = {"hall"}
     trial.keeper.reconcile()
@@ -226,7 +226,7 @@ async def test_a_line_is_closed_before_it_is_released() -> None:
     assert trial.owner() == ("", 0)
 
 
-async def test_a_line_is_not_polled_while_its_release_may_be_stored() -> None:
+async def test_line_is_not_polled_while_an_unanswered_release_is_pending() -> None:
     """The unanswered write of the release may be stored at any later time, until a newer record exists."""
     trial = await claimed()
     bucket = trial.buckets[0]
@@ -269,7 +269,7 @@ async def test_a_line_of_a_dead_master_is_claimed_by_writing_two_records() -> No
 
 
 @pytest.mark.parametrize("place", [0, 1])
-async def test_a_line_is_claimed_although_one_nats_bucket_has_no_leader(place: int) -> None:
+async def test_line_is_claimed_even_if_one_nats_bucket_has_no_leader(place: int) -> None:
     trial = DeadTrial()
     await trial.read_and_begin()
     trial.buckets[place].is_down = True
@@ -279,7 +279,7 @@ async def test_a_line_is_claimed_although_one_nats_bucket_has_no_leader(place: i
     assert owners(trial).count(ME) == 2
 
 
-async def test_a_line_is_claimed_although_one_of_its_buckets_answers_late(
+async def test_line_is_claimed_even_if_one_bucket_answers_late(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(line_keeper, "SPARE_S", 0.0)
@@ -310,7 +310,7 @@ async def test_a_refused_claim_does_not_wait_for_a_late_answer(monkeypatch: pyte
     assert owners(trial) == [ME, ME, NOBODY]
 
 
-async def test_ownership_is_written_last_to_a_server_that_may_have_failed() -> None:
+async def test_claim_is_written_last_to_a_possibly_failed_server() -> None:
     trial = DeadTrial()
     await trial.read_and_begin()
     await trial.let_the_first_lag()
@@ -319,7 +319,7 @@ async def test_ownership_is_written_last_to_a_server_that_may_have_failed() -> N
     assert owners(trial) == [NOBODY, ME, ME]
 
 
-async def test_ownership_is_written_in_the_usual_order_if_all_servers_are_slow() -> None:
+async def test_claim_keeps_the_usual_server_order_if_all_are_slow() -> None:
     """If all lease records are renewed late, the servers are busy, and probably none has failed."""
     trial = DeadTrial()
     await trial.read_and_begin()
@@ -330,7 +330,7 @@ async def test_ownership_is_written_in_the_usual_order_if_all_servers_are_slow()
     assert owners(trial) == [ME, ME, NOBODY]
 
 
-async def test_a_claim_ends_although_the_server_of_its_bucket_has_failed(
+async def test_claim_of_a_line_does_not_wait_forever_for_a_failed_server(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The first record of a new line must be in this bucket. Its server does not answer."""
@@ -356,7 +356,9 @@ async def test_a_claim_of_a_line_fails_if_another_gateway_was_faster() -> None:
     assert not trial.keeper.polled
 
 
-async def test_a_late_claim_does_not_reopen_a_released_line(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_line_stays_closed_if_a_claim_is_answered_during_the_release(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """The line must stay closed while the records of its release are being written."""
     monkeypatch.setattr(line_keeper, "SPARE_S", 0.0)
     trial = DeadTrial()
@@ -381,7 +383,7 @@ async def test_a_late_claim_does_not_reopen_a_released_line(monkeypatch: pytest.
     await until(lambda: owners(trial) == [NOBODY] * 3)
 
 
-async def test_a_late_answer_to_a_claim_does_not_undo_the_lines_release() -> None:
+async def test_released_line_stays_released_after_a_late_claim_answer() -> None:
     """The gateway reads its stored claim, then releases the line, and gets the answer to its claim last."""
     trial = Trial()
     await trial.read_and_begin()
@@ -401,7 +403,7 @@ async def test_a_late_answer_to_a_claim_does_not_undo_the_lines_release() -> Non
     assert trial.lines.taken == set()
 
 
-async def test_a_line_whose_release_got_no_answer_is_claimed_again_if_allowed() -> None:
+async def test_line_is_claimed_again_after_an_unanswered_release() -> None:
     trial = await claimed()
     trial.are_down()
     trial.keeper.releasing = {"hall"}
@@ -419,7 +421,7 @@ async def test_a_line_whose_release_got_no_answer_is_claimed_again_if_allowed() 
     await until(lambda: "hall" in trial.keeper.polled)
 
 
-async def test_a_line_that_cannot_be_closed_ends_the_gateway() -> None:
+async def test_gateway_ends_if_a_line_cannot_be_closed() -> None:
     """The line may still be open, so the gateway does not end its session. Others wait for its lease."""
     trial = await claimed()
 
@@ -435,7 +437,7 @@ async def test_a_line_that_cannot_be_closed_ends_the_gateway() -> None:
     assert trial.keeper.polled
 
 
-async def test_a_failure_on_one_line_affects_only_that_line(caplog: pytest.LogCaptureFixture) -> None:
+async def test_failure_to_open_one_line_does_not_affect_other_lines(caplog: pytest.LogCaptureFixture) -> None:
     """The failure is an exception, as from a user's drive class."""
     trial = Trial()
     take, failures = trial.lines.take, [ZeroDivisionError("of a user's class")]
@@ -495,7 +497,7 @@ class BrokenTrial(Trial):
         await until(lambda: not self.keeper._at_work)
 
 
-async def test_a_line_that_cannot_be_opened_is_logged_once_per_reason(
+async def test_failure_to_open_a_line_is_logged_once_per_reason(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
@@ -517,7 +519,7 @@ async def test_a_line_that_cannot_be_opened_is_logged_once_per_reason(
     ]
 
 
-async def test_the_error_of_a_line_polled_elsewhere_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_line_error_is_forgotten_when_the_line_is_released(monkeypatch: pytest.MonkeyPatch) -> None:
     trial = BrokenTrial(monkeypatch)
     await trial.claim()
     trial.keeper.releasing = {"hall"}
@@ -536,7 +538,9 @@ async def test_the_error_of_a_line_polled_elsewhere_is_forgotten(monkeypatch: py
         (PortLoss("no route to host", SECOND), "no route to host"),
     ],
 )
-async def test_a_lost_port_is_reported_before_it_is_reopened(loss: PortLoss, reported: str | None) -> None:
+async def test_lost_port_is_reported_if_reopening_fails_or_takes_long(
+    loss: PortLoss, reported: str | None
+) -> None:
     trial = await claimed()
     await until(lambda: "hall" in trial.keeper.polled)
     await until(lambda: not trial.keeper._at_work)

@@ -157,7 +157,7 @@ async def other_version(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> As
 
 @pytest.mark.slow
 @pytest.mark.long
-async def test_each_gateway_polls_its_share_and_others_take_a_dead_gateways_lines(fleet: Cluster) -> None:
+async def test_other_gateways_take_over_the_lines_of_a_dead_gateway(fleet: Cluster) -> None:
     async with gateways(fleet, "a", "b", "c") as running:
         await until(lambda: all(5 <= len(lines) <= 11 for lines in running.taken().values()), "shares")
         dead = running.members["b"]
@@ -193,7 +193,7 @@ class Ports:
 
 @pytest.mark.slow
 @pytest.mark.long
-async def test_a_line_goes_to_another_gateway_if_its_port_cannot_be_opened(
+async def test_line_moves_to_another_gateway_if_the_port_cannot_be_opened(
     fleet: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A gateway is cut off from its lines but not from the servers, so its lease stays valid."""
@@ -257,7 +257,7 @@ async def test_a_silent_server_delays_handovers_of_lines_except_after_fleet_drai
 
 @pytest.mark.slow
 @pytest.mark.long
-async def test_a_gateway_that_shuts_down_hands_its_lines_over_immediately(fleet: Cluster) -> None:
+async def test_gateway_hands_over_all_lines_immediately_at_shutdown(fleet: Cluster) -> None:
     async with gateways(fleet, "a", "b", terms=LONG) as running:
         await running.leave("a")
         await until(running.all_are_polled, "leave")
@@ -288,7 +288,7 @@ async def test_lines_are_added_changed_and_removed_with_the_plant(fleet: Cluster
 
 @pytest.mark.slow
 @pytest.mark.long
-async def test_no_line_gets_a_new_master_beside_an_incompatible_gateway(
+async def test_no_line_gets_a_new_master_while_an_incompatible_gateway_runs(
     fleet: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The incompatible gateway is alive at the start of this gateway, or joins the fleet later."""
@@ -446,7 +446,7 @@ def test_status_names_an_incompatible_gateway_until_its_session_ends(trial: Tria
     assert trial.trouble == ""
 
 
-def test_a_gateway_that_reports_no_version_of_its_rules_is_incompatible(trial: Trial) -> None:
+def test_gateway_without_a_rules_version_is_incompatible(trial: Trial) -> None:
     trial.begin("first", RULES)
     for bucket in trial.buckets:
         bucket.store(
@@ -455,7 +455,7 @@ def test_a_gateway_that_reports_no_version_of_its_rules_is_incompatible(trial: T
     assert trial.trouble == SENTENCE.format("first")
 
 
-def test_a_killed_incompatible_gateway_is_ignored_when_its_lease_has_expired(trial: Trial) -> None:
+def test_killed_incompatible_gateway_is_ignored_after_lease_expiry(trial: Trial) -> None:
     trial.begin("older", RULES - 1)
     assert trial.trouble
     trial.clock.now += USUAL.lease - 1
@@ -464,7 +464,7 @@ def test_a_killed_incompatible_gateway_is_ignored_when_its_lease_has_expired(tri
     assert trial.trouble == ""
 
 
-def test_an_earlier_session_of_the_same_gateway_is_not_reported_as_incompatible(trial: Trial) -> None:
+def test_gateway_does_not_report_its_own_earlier_session_as_incompatible(trial: Trial) -> None:
     trial.begin("me", RULES - 1)
     assert trial.trouble == ""
 
@@ -515,7 +515,7 @@ def test_a_changed_record_causes_an_immediate_step_of_the_state_machine(times: i
     assert steps(wake) == pytest.approx([0.0, 0.05, 0.06, 0.11])
 
 
-def test_there_is_a_pause_of_10_ms_between_steps_however_often_records_change() -> None:
+def test_state_machine_pauses_10_ms_between_steps() -> None:
     def wake(member: Member) -> None:
         member.records._on_change()
         if len(asyncio.all_tasks()) > 1:
@@ -527,7 +527,9 @@ def test_there_is_a_pause_of_10_ms_between_steps_however_often_records_change() 
 
 
 @pytest.mark.parametrize(("left_s", "ends"), [(2.0, True), (0.9, False), (-1.0, False)])
-async def test_a_gateway_whose_lease_expires_soon_ends_no_other_session(left_s: float, ends: bool) -> None:
+async def test_gateway_ends_no_other_session_just_before_its_own_lease_expires(
+    left_s: float, ends: bool
+) -> None:
     """If its own lease expires, all servers may be failing. A session that it ended could not continue."""
     member = a_member()
     clock = HandClock()

@@ -103,7 +103,7 @@ CASES = {
 
 
 @table("case", CASES)
-def test_a_gateway_claims_and_releases_lines_according_to_their_records(case: str) -> None:
+def test_claims_and_releases_follow_the_ownership_records(case: str) -> None:
     found, wanted = CASES[case]
     assert found == wanted
 
@@ -115,7 +115,7 @@ def test_a_line_is_not_claimed_before_its_first_bucket_was_read() -> None:
     assert claim_of(ME, {}, is_over) is None
 
 
-def test_a_claim_writes_no_ownership_record_that_was_not_read() -> None:
+def test_claim_writes_only_ownership_records_that_were_read() -> None:
     records = records_of(DEAD, DEAD, DEAD)
     records["second"] = None
     assert claim_of(ME, records, is_over) == Claim({"first": 11, "third": 13}, {}, 6)
@@ -123,7 +123,7 @@ def test_a_claim_writes_no_ownership_record_that_was_not_read() -> None:
     assert claim_of(ME, records, is_over) is None
 
 
-def test_a_bucket_that_may_have_no_leader_is_written_last() -> None:
+def test_claim_is_written_last_to_a_bucket_without_a_leader() -> None:
     records = records_of(DEAD, DEAD, DEAD)
     assert claim_of(ME, records, is_over) == Claim({"first": 11, "second": 12}, {"third": 13}, 6)
     claim = claim_of(ME, records, is_over, leaderless=["first"])
@@ -133,7 +133,7 @@ def test_a_bucket_that_may_have_no_leader_is_written_last() -> None:
     assert claim == Claim({"second": 12, "first": 11}, {}, 6)
 
 
-def test_a_claim_replaces_records_whose_release_got_no_answer() -> None:
+def test_claim_replaces_records_of_an_unanswered_release() -> None:
     records = records_of(ME, ME, LIVING)
     assert claim_of(ME, records, is_over) is None
     assert claim_of(ME, records, is_over, ["second"]) == Claim({"second": 12}, {}, 6)
@@ -145,7 +145,7 @@ def owner_by_records(*owners: tuple[str, int] | None, alone: bool = False) -> tu
     return record and (record.value["gateway"], record.value["session"])
 
 
-def test_a_line_has_an_owner_only_if_two_votes_agree() -> None:
+def test_owner_of_a_line_needs_two_equal_votes() -> None:
     assert owner_by_records(LIVING, DEAD, LIVING) == LIVING
     assert owner_by_records(LIVING, NEVER, NEVER, alone=True) == LIVING
     assert owner_by_records(GIVEN, ME, GIVEN) == GIVEN
@@ -153,7 +153,7 @@ def test_a_line_has_an_owner_only_if_two_votes_agree() -> None:
     assert owner_by_records(LIVING, NEVER, NEVER) is None
 
 
-def test_the_newer_of_two_owners_with_two_votes_is_shown() -> None:
+def test_newer_owner_is_shown_if_an_old_record_also_has_two_votes() -> None:
     """A dead session's old record with two votes is left, because its bucket had no leader for a while."""
     records = records_of(DEAD, ME, ME, alone=True)
     for bucket in ("second", "third"):
@@ -170,7 +170,7 @@ def test_the_newer_of_two_owners_with_two_votes_is_shown() -> None:
         *[("a/b", "a-b"), ("x\n", "x"), ("", "line-1"), ("*", "line-1"), (">", "line-1")],
     ],
 )
-def test_a_line_name_that_nats_subjects_do_not_allow_gets_a_suggestion(name: str, better: str) -> None:
+def test_error_for_an_invalid_line_name_suggests_a_valid_name(name: str, better: str) -> None:
     with pytest.raises(ValueError, match=f"may have only letters, digits, _ and -: write {better}$"):
         names.checked_name("line", name)
     assert names.is_name(better)
@@ -277,7 +277,7 @@ def test_lines_are_handed_over_after_a_server_was_silent_for_60_s(monkeypatch: p
     assert trial.releases.due(FIRST_LINES) == set()
 
 
-def test_a_gateway_that_gives_up_all_lines_ignores_silent_servers(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gateway_gives_up_all_lines_even_if_servers_are_silent(monkeypatch: pytest.MonkeyPatch) -> None:
     trial = Releasing(monkeypatch)
     trial.maimed = set(names.OWNERS)
     trial.led.remove("own_2")
@@ -295,7 +295,7 @@ def test_a_gateway_that_gives_up_all_lines_ignores_silent_servers(monkeypatch: p
 
 @pytest.mark.slow
 @pytest.mark.long
-def test_each_of_1000_lines_has_one_gateway_after_5_of_20_die_and_return(nats: Servers) -> None:
+def test_each_of_1000_lines_has_one_gateway_after_5_gateways_restart(nats: Servers) -> None:
     with large_fleet(nats, plant_of_fake_lines(1000)) as fleet:
         fleet.settled(fleet.start(*groups(20, 4)))
         until(lambda: 30 <= fleet.loads()[0] <= fleet.loads()[-1] <= 55, "each has its share")

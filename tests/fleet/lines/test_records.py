@@ -48,7 +48,7 @@ class Trial:
         return self.bucket.asked > before
 
 
-def test_ownership_records_of_free_lines_and_of_own_lines_are_read_once() -> None:
+def test_gateway_reads_records_of_its_own_and_free_lines_only_once() -> None:
     trial = Trial()
     trial.bucket.store("mine", ME)
     trial.bucket.store("free", NOBODY)
@@ -62,7 +62,7 @@ def test_ownership_records_of_free_lines_and_of_own_lines_are_read_once() -> Non
 
 
 @pytest.mark.parametrize("value", [OTHER, owner_value(("a", 1), 1, 0)])
-def test_an_ownership_record_is_read_again_until_it_names_no_gateway(value: Any) -> None:
+def test_ownership_record_is_read_repeatedly_while_it_names_a_gateway(value: Any) -> None:
     trial = Trial()
     trial.bucket.store("line", value)
     trial.follower.want(["line"])
@@ -73,7 +73,7 @@ def test_an_ownership_record_is_read_again_until_it_names_no_gateway(value: Any)
     assert not trial.asks()
 
 
-def test_ownership_records_of_own_lines_are_not_read() -> None:
+def test_gateway_stops_reading_the_record_of_a_claimed_line() -> None:
     trial = Trial()
     trial.bucket.store("line", OTHER)
     trial.follower.want(["line"])
@@ -84,7 +84,7 @@ def test_ownership_records_of_own_lines_are_not_read() -> None:
     assert not trial.asks()
 
 
-def test_a_record_with_an_unanswered_write_is_read_again_for_30_s(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_record_is_read_for_30_s_after_an_unanswered_write(monkeypatch: pytest.MonkeyPatch) -> None:
     """The write may still be stored once the bucket has a leader again."""
     now = 1000.0
     monkeypatch.setattr(line_records.time, "monotonic", lambda: now)
@@ -151,7 +151,7 @@ def test_a_change_of_masters_is_seen_when_two_ownership_records_agree() -> None:
     assert moves_of(records) == [("b", "a"), ("", "b")]
 
 
-def test_a_line_with_one_record_for_each_of_two_gateways_is_listed_for_both() -> None:
+def test_line_is_listed_for_two_gateways_if_records_disagree() -> None:
     records = followed()
     take(records, 1, OTHER, FIRST_BUCKET, SECOND_BUCKET)
     take(records, 2, ME, FIRST_BUCKET)
@@ -173,7 +173,7 @@ def test_the_former_master_is_unknown_if_earlier_records_were_not_read() -> None
     assert moves_of(records)[0] == ("a", "")
 
 
-def test_a_line_that_its_master_claims_again_has_not_changed_masters() -> None:
+def test_claiming_an_own_line_again_does_not_count_as_a_change() -> None:
     """The master claims its own line again because the outcome of the line's release was unknown."""
     records = followed()
     take(records, 1, owner_value(("a", 2), 1, 0), FIRST_BUCKET, SECOND_BUCKET)
@@ -183,7 +183,7 @@ def test_a_line_that_its_master_claims_again_has_not_changed_masters() -> None:
     assert moves_of(records) == [("a", "b"), ("", "a")]
 
 
-def test_a_session_that_owns_no_line_any_longer_is_forgotten() -> None:
+def test_session_without_lines_is_forgotten() -> None:
     records = followed()
     for session in range(1, 1000):
         take(records, session, owner_value(("b", session), session, 0), FIRST_BUCKET, SECOND_BUCKET)
@@ -192,7 +192,7 @@ def test_a_session_that_owns_no_line_any_longer_is_forgotten() -> None:
     assert len(records._owned) == 1
 
 
-def test_plant_lines_that_were_read_before_a_failed_read_stay_known(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_known_plant_lines_are_kept_if_a_later_read_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two reads return all lines. The last read, which would return no further lines, fails."""
     monkeypatch.setattr(buckets, "BATCH", 2)
     path: Any = None
@@ -268,7 +268,7 @@ def test_changes_of_masters_are_listed_newest_first(moves: list[Move], shown: li
     assert told(*moves) == shown
 
 
-def test_a_release_and_a_claim_of_a_line_form_one_change() -> None:
+def test_release_and_following_claim_are_listed_as_one_change() -> None:
     """One gateway reports only the release, the other only the claim."""
     giver, taker = [FIRST, RELEASE], [move(2, None, ""), CLAIM]
     back = [move_of(one.as_json()) for one in (*giver, *taker, *giver)]

@@ -35,7 +35,7 @@ def moved(before: dict[str, str], after: dict[str, str]) -> int:
     return sum(before[line] != after[line] for line in before)
 
 
-def test_no_gateway_has_more_than_110_percent_of_the_mean() -> None:
+def test_no_gateway_gets_more_than_110_percent_of_the_mean_line_count() -> None:
     shares = Counter(assign(LINES, GATEWAYS).values())
     assert sum(shares.values()) == len(LINES)
     assert max(shares.values()) <= 55
@@ -67,7 +67,7 @@ def weight(line: str, gateway: str, number: int) -> int:
 
 @table("number", [1, 2, 3, 5, 20])
 @table("lines", [1, 7, 40, 333])
-def test_each_line_has_the_gateway_of_greatest_weight_that_has_room(lines: int, number: int) -> None:
+def test_line_is_assigned_to_the_highest_weighted_gateway_with_room(lines: int, number: int) -> None:
     """All versions must use the same weights; otherwise they would move lines back and forth."""
     room = dict.fromkeys(GATEWAYS[:number], -(-lines * 110 // (100 * number)))
     wanted = {}
@@ -121,7 +121,7 @@ def test_a_gateway_that_rejoins_a_running_fleet_gets_its_share_immediately() -> 
     assert trial.is_shared_with("b", "c")
 
 
-def test_a_starting_fleet_assigns_lines_when_no_more_gateways_join() -> None:
+def test_starting_fleet_waits_until_no_more_gateways_join() -> None:
     """Otherwise the first gateway would read the records of all lines, and the second one half of them."""
     trial = Trial()
     assert trial.shared_among("b") == set()
@@ -159,7 +159,7 @@ def reported(*lines: str) -> tuple[HandClock, UnopenedLines]:
     return clock, unopened
 
 
-def test_a_port_that_fails_to_open_three_times_is_reported() -> None:
+def test_port_is_reported_after_three_failed_attempts_to_open() -> None:
     unopened = UnopenedLines(HandClock())
     for _ in range(OPENINGS - 1):
         unopened.failed("a")
@@ -173,7 +173,7 @@ def test_a_port_that_fails_to_open_three_times_is_reported() -> None:
     assert unopened.named() == frozenset()
 
 
-def test_a_polled_line_is_reported_when_its_port_is_lost_for_6_s() -> None:
+def test_line_is_reported_when_its_port_stays_lost_for_6_s() -> None:
     clock = HandClock()
     unopened = UnopenedLines(clock)
     unopened.lost("a")
@@ -193,7 +193,9 @@ def test_a_polled_line_is_reported_when_its_port_is_lost_for_6_s() -> None:
     ("silent_s", "named_after_s"),
     [(2.0, 4.0), (REPLY_NS / SECOND, 3.0), (60.0, 6.0), (None, 6.0)],  # None: the line never had a reply
 )
-def test_a_line_with_a_lost_port_is_reported_after_6_s(silent_s: float | None, named_after_s: float) -> None:
+def test_recent_silence_counts_toward_the_6_s_of_a_lost_port(
+    silent_s: float | None, named_after_s: float
+) -> None:
     """A gateway notices a cut line only after seconds, so the 6 s start at the last reply before the cut."""
     clock = HandClock()
     unopened = UnopenedLines(clock)
@@ -209,7 +211,7 @@ def test_a_line_with_a_lost_port_is_reported_after_6_s(silent_s: float | None, n
     assert lost_after(0.1)
 
 
-def test_closed_ports_are_retried_one_after_another_with_increasing_pauses() -> None:
+def test_failed_ports_are_retried_in_turn_with_increasing_pauses() -> None:
     clock, unopened = reported(*"abc")
     wait_s = FIRST_WAIT_NS / SECOND
     for line in "abcab":
@@ -222,7 +224,7 @@ def test_closed_ports_are_retried_one_after_another_with_increasing_pauses() -> 
         wait_s = min(2 * wait_s, LAST_WAIT_NS / SECOND)
 
 
-def test_a_line_that_no_gateway_can_open_is_retried_first() -> None:
+def test_line_is_retried_first_if_no_gateway_can_open_its_port() -> None:
     clock, unopened = reported(*"abc")
     unopened.hopeless = frozenset("b")
     for _ in range(5):
@@ -255,7 +257,7 @@ def test_a_gateway_first_retries_the_lines_that_it_usually_polls() -> None:
     assert unopened.named() == frozenset()
 
 
-def test_another_line_is_retried_if_the_first_one_is_not_assigned_in_time() -> None:
+def test_next_line_is_retried_if_the_first_is_not_assigned_in_time() -> None:
     clock, unopened = reported("a", "b")
     clock.pass_s(FIRST_WAIT_NS / SECOND)
     assert unopened.named() == {"b"}
@@ -263,7 +265,7 @@ def test_another_line_is_retried_if_the_first_one_is_not_assigned_in_time() -> N
     assert unopened.named() == frozenset()
 
 
-def test_the_names_of_reported_lines_are_limited_to_8_kb() -> None:
+def test_list_of_failed_lines_is_limited_in_bytes() -> None:
     _, unopened = reported(*(f"line-{number}" for number in range(MOST_BYTES // 8)))
     assert 0 < sum(len(line) + 4 for line in unopened.named()) <= MOST_BYTES
 
@@ -273,23 +275,23 @@ SHARED = assign(SIXTY, ["a", "b", "c"])
 OF_A = {line for line, name in SHARED.items() if name == "a"}
 
 
-def test_all_gateways_reassign_exactly_the_lines_that_cannot_be_opened() -> None:
+def test_only_lines_that_cannot_be_opened_are_reassigned() -> None:
     found = hand_over(SHARED, {"a": OF_A, "b": [], "c": []})
     assert set(found.values()) == {"b", "c"}
     assert {line for line in SIXTY if found[line] != SHARED[line]} == OF_A
     assert found == hand_over(dict(reversed(SHARED.items())), {"c": [], "b": [], "a": sorted(OF_A)})
 
 
-def test_a_line_that_no_gateway_can_open_stays_with_its_gateway() -> None:
+def test_line_keeps_its_gateway_if_no_gateway_can_open_the_port() -> None:
     assert hand_over(SHARED, {"a": SIXTY, "b": SIXTY, "c": SIXTY}) == SHARED
 
 
-def test_a_line_is_assigned_to_a_gateway_that_can_open_its_port() -> None:
+def test_line_is_assigned_to_a_gateway_that_can_open_the_port() -> None:
     found = hand_over(SHARED, {"a": OF_A, "b": OF_A, "c": []})
     assert {found[line] for line in OF_A} == {"c"}
 
 
-def test_a_gateway_that_reports_no_list_of_failed_lines_gets_no_others() -> None:
+def test_failed_lines_are_not_assigned_to_a_gateway_without_a_report() -> None:
     """A gateway of another version reports no list, and would not take lines that others could not open."""
     assert hand_over(SHARED, {"a": OF_A}) == SHARED
     assert set(hand_over(SHARED, {"a": OF_A, "c": []}).values()) == {"b", "c"}

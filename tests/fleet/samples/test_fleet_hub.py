@@ -154,7 +154,7 @@ def test_the_hub_waits_if_a_server_lacks_the_newest_messages(
 
 @pytest.mark.long
 @pytest.mark.parametrize("fates", ["", "bababb", "aaaa"])
-async def test_each_row_is_stored_once_although_the_sink_fails(running: Cluster, fates: str) -> None:
+async def test_each_row_is_stored_once_despite_failed_writes(running: Cluster, fates: str) -> None:
     async with empty_stream(running) as path:
         await say_all(path, 1, 31)
         sink = Memory(fates)
@@ -165,7 +165,7 @@ async def test_each_row_is_stored_once_although_the_sink_fails(running: Cluster,
 
 
 @pytest.mark.slow
-async def test_messages_that_are_read_in_several_parts_are_stored_once(
+async def test_hub_stores_messages_once_if_read_in_several_parts(
     running: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(hub_module, "MOST_READ", 3)
@@ -240,7 +240,7 @@ async def test_the_hub_reports_removed_messages_once(
     assert f"gateway-1.{LOG}: messages 1 to 3 are missing" in caplog.text
 
 
-async def test_the_hub_refuses_a_stream_that_has_lost_its_newest_messages(running: Cluster) -> None:
+async def test_hub_refuses_a_stream_without_the_messages_stored_last(running: Cluster) -> None:
     async with empty_stream(running) as path:
         await say(path, 1, message(0))
         sink = Memory()
@@ -348,7 +348,7 @@ def test_the_hub_refuses_a_folder_of_another_stream_or_program(tmp_path: Path) -
         ParquetSink(tmp_path)
 
 
-def test_the_hub_refuses_a_folder_that_it_cannot_write(tmp_path: Path) -> None:
+def test_hub_refuses_an_unwritable_folder(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(SinkError, match="cannot be written: Not a directory"):
         ParquetSink(tmp_path / "file")
@@ -434,7 +434,7 @@ def test_a_second_hub_waits_until_the_first_one_has_left_the_database(empty: Pos
 
 
 @pytest.mark.slow
-def test_a_hub_stops_writing_if_another_hub_has_changed_the_stored_position(empty: Postgres) -> None:
+def test_hub_stops_writing_if_another_hub_changed_the_stored_position(empty: Postgres) -> None:
     """Behind a connection pooler, several hubs may share one lock, so the database checks the position."""
     sink = PostgresSink(empty.where)
     sink.begin("then")

@@ -90,7 +90,7 @@ async def store(spool: Spool, first: int) -> None:
 
 
 @table("name", ["", "a.b", "a b", "*", ">", "ä", "a/b"])
-def test_a_gateway_name_that_nats_subjects_do_not_allow_is_rejected(name: str) -> None:
+def test_gateway_name_with_invalid_characters_is_rejected(name: str) -> None:
     spool: Any = SimpleNamespace(gateway=name, log="00112233aabbccdd")
     with pytest.raises(ValueError, match="may have only letters, digits, _ and -"):
         Forwarder(spool, spool)
@@ -181,7 +181,9 @@ class Lossy:
 
 
 @pytest.mark.parametrize("fates", ["aaaaaaa", "bbabab", "ababaaabb", "llaboabl", "alolalolb"])
-async def test_lost_messages_or_answers_are_repeated(running: Cluster, tmp_path: Path, fates: str) -> None:
+async def test_forwarder_sends_unanswered_messages_again(
+    running: Cluster, tmp_path: Path, fates: str
+) -> None:
     spool = filled(tmp_path / "spool", 6)
     async with empty_stream(running) as path, forwarding(spool, Lossy(path, fates)) as forwarder:
         await until(lambda: forwarder.last == 6)
@@ -190,7 +192,7 @@ async def test_lost_messages_or_answers_are_repeated(running: Cluster, tmp_path:
     spool.close()
 
 
-async def test_the_forwarder_ignores_answers_of_servers(running: Cluster, tmp_path: Path) -> None:
+async def test_forwarder_ignores_server_answers_among_its_samples(running: Cluster, tmp_path: Path) -> None:
     """Any client may direct a server's answer to the subject of a gateway's samples."""
     spool = filled(tmp_path / "spool", 2)
     subject = subject_of("gateway-1", spool.log)
@@ -216,7 +218,7 @@ class Refusing(Lossy):
         return await self._path.request(subject, data, *details, **more)
 
 
-async def test_a_stream_that_refuses_messages_is_logged_once(
+async def test_refusal_of_messages_by_the_stream_is_logged_once(
     running: Cluster, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     spool = filled(tmp_path / "spool", 2)
@@ -242,7 +244,7 @@ async def test_the_forwarder_skips_messages_removed_from_the_spool(running: Clus
     spool.close()
 
 
-async def test_a_spool_folder_restored_from_a_backup_is_reported_and_not_forwarded(
+async def test_messages_of_a_restored_backup_folder_are_not_forwarded(
     running: Cluster, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     spool = filled(tmp_path / "spool", 2)
@@ -352,7 +354,7 @@ def chaos(monkeypatch: pytest.MonkeyPatch) -> Any:
     return importlib.import_module("bench.questions.fleet.chaos")
 
 
-def test_the_check_after_random_kills_finds_lost_and_duplicated_rows(chaos: Any) -> None:
+def test_chaos_tool_finds_lost_and_duplicated_rows(chaos: Any) -> None:
     told = {"gateway-1": {0: 4, 1_000_000: 2}, "gateway-2": {0: 3}}
     whole = {
         # rows 4 and 5 were stored, although the gateway was killed before it had reported them
@@ -368,7 +370,7 @@ def test_the_check_after_random_kills_finds_lost_and_duplicated_rows(chaos: Any)
     assert chaos.compare(told, doubled) == (9, 0, 0, 1)
 
 
-def test_alarms_in_the_log_of_a_hub_are_found_after_random_kills(
+def test_chaos_tool_finds_alarms_in_the_hub_log(
     chaos: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     check = SourceCheck({})
@@ -383,7 +385,7 @@ def test_alarms_in_the_log_of_a_hub_are_found_after_random_kills(
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_no_sample_is_lost_at_random_kills(chaos: Any, tmp_path: Path) -> None:
+def test_no_sample_is_lost_when_processes_are_killed_at_random(chaos: Any, tmp_path: Path) -> None:
     wrong = chaos.run(tmp_path, 12.0, random.Random(2))
     print(*(f"{path.name}: {path.read_text()[-2000:]}" for path in tmp_path.glob("*.log")), sep="\n")
     assert wrong == 0
@@ -439,7 +441,7 @@ def settled(spool: Spool, most: int) -> SpoolState:
 
 
 @pytest.mark.long
-async def test_each_row_is_stored_or_counted_as_lost_after_a_long_outage(tmp_path: Path, most: int) -> None:
+async def test_rows_are_stored_or_counted_as_lost_after_a_long_outage(tmp_path: Path, most: int) -> None:
     """The spool cannot hold all rows of the outage."""
     require_module("duckdb")
     with cluster(tmp_path / "nats", 1) as servers:

@@ -76,7 +76,7 @@ def units_in(table: pa.Table, register: str) -> list[tuple[int, str | None]]:
     return sorted(((time - NOON) // STEP, unit) for time, *of, unit in rows if of == ["pump-1", register])
 
 
-def test_a_row_keeps_its_unit_when_the_registers_unit_changes_later(tmp_path: Path) -> None:
+def test_stored_row_keeps_its_unit_after_the_register_unit_changes(tmp_path: Path) -> None:
     """The old unit stays even if rows of both units are packed into one message after the change."""
     (table,) = tables(changed(tmp_path))
     assert units_in(table, "value_1") == [(at, "V" if at < 20 else "A") for at in range(0, 40, 4)]
@@ -120,7 +120,7 @@ def test_merged_files_keep_units_even_if_some_rows_have_no_unit(tmp_path: Path) 
     assert {found[at] for at in range(52, 90, 4)} == {"A"}
 
 
-def test_a_unit_has_the_same_name_in_a_gateway_and_in_a_history() -> None:
+def test_gateway_and_history_use_the_same_unit_names() -> None:
     plant = {"drives": {"a": {"model": "meter.toml", "registers": {"b": {"values": {"ON": 1}}}}}}
     assert unit_texts_of(plant) == {("a", "b"): "names of meter.toml"}
     assert RAW == HISTORY_RAW
@@ -145,7 +145,7 @@ def kept(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
 
 
 @pytest.mark.slow
-def test_rows_that_two_gateways_have_polled_are_read_in_the_order_of_time(tmp_path: Path) -> None:
+def test_rows_of_two_gateways_are_read_in_order_of_time(tmp_path: Path) -> None:
     """The second gateway has taken over the lines, and was started later, so its monotonic time is lower."""
     require_module("duckdb")
     (first,), (second,) = tables(None), tables(None, 40)

@@ -55,7 +55,9 @@ def test_nats_py_still_has_the_method_that_receives_answers() -> None:
     assert inspect.iscoroutinefunction(Client._process_msg)
 
 
-async def test_answers_to_batches_bypass_nats_py(one: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_answers_to_batch_requests_are_not_handled_by_nats_py(
+    one: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
     async def fail(self: BatchClient, message: object) -> None:
         raise AssertionError("it came in nats-py's own way")
 
@@ -82,7 +84,7 @@ def _rested(path: ServerPath) -> None:
         b"NATS/1.0 404 No Messages\r\nNats-Sequence: none\r\n",
     ],
 )
-def test_headers_of_the_server_take_precedence_over_headers_of_the_writer(writers: bytes) -> None:
+def test_server_headers_override_headers_from_the_writer(writers: bytes) -> None:
     assert stored_message(writers + SERVERS, b"x") == DirectMessage("$KV.own_0.a", 7, b"x")
 
 
@@ -95,13 +97,11 @@ def test_headers_of_the_server_take_precedence_over_headers_of_the_writer(writer
         b"NATS/1.0\r\nNats-Subject: a\r\nNats-Sequence: -1\r\n\r\n",
     ],
 )
-def test_a_message_without_a_valid_subject_and_sequence_is_no_stored_message(headers: bytes) -> None:
+def test_stored_message_requires_a_valid_subject_and_sequence(headers: bytes) -> None:
     assert stored_message(headers, b"") is None
 
 
-async def test_an_answer_is_complete_although_a_record_imitates_the_end_of_answers(
-    one: Cluster, way: str
-) -> None:
+async def test_record_that_imitates_the_end_marker_does_not_shorten_an_answer(one: Cluster, way: str) -> None:
     async with connected_path(one) as path:
         bucket = Bucket("own_0", lambda: path)
         await bucket.put(f"{way}-a", OWNER, 0)
@@ -120,7 +120,7 @@ async def test_an_answer_is_complete_although_a_record_imitates_the_end_of_answe
         assert keys == [f"{way}-a", f"{way}-b", f"{way}-c"]
 
 
-async def test_a_batch_replaces_only_records_that_have_the_expected_revision(one: Cluster, way: str) -> None:
+async def test_batch_write_replaces_only_records_of_the_expected_revision(one: Cluster, way: str) -> None:
     async with connected_path(one) as path:
         bucket = Bucket("own_1", lambda: path)
         a, b, c = f"{way}-a", f"{way}-b", f"{way}-c"
@@ -139,7 +139,7 @@ async def test_a_batch_replaces_only_records_that_have_the_expected_revision(one
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("way")
-async def test_requests_without_an_answer_and_without_a_receiver_are_distinguished(one: Cluster) -> None:
+async def test_missing_receiver_is_distinguished_from_a_missing_answer(one: Cluster) -> None:
     client = await connect(one.urls[0], {})
     deaf = await client.subscribe("deaf")
     mute = Request("deaf", b"")
@@ -161,7 +161,7 @@ async def test_requests_without_an_answer_and_without_a_receiver_are_distinguish
 
 @pytest.mark.long
 @pytest.mark.parametrize(("deaf_to", "is_told"), [(0, True), (1, True), (4, True), (5, False)])
-async def test_a_read_that_is_lost_on_a_cut_off_server_is_repeated(
+async def test_unanswered_read_is_repeated_on_the_same_connection(
     one: Cluster, monkeypatch: pytest.MonkeyPatch, deaf_to: int, is_told: bool
 ) -> None:
     monkeypatch.setattr(connections, "AGAIN_S", (0.1,) * 4 + (30.0 if is_told else 0.1,))
@@ -192,7 +192,7 @@ async def test_a_read_that_is_lost_on_a_cut_off_server_is_repeated(
         await other.close()
 
 
-async def test_a_read_on_a_cut_off_connection_is_repeated_on_other_connections(one: Cluster) -> None:
+async def test_read_is_repeated_on_other_connections_if_one_is_cut_off(one: Cluster) -> None:
     async with opened_paths(one.urls) as paths:
         asked: list[Request] = []
 
@@ -210,7 +210,7 @@ async def test_a_read_on_a_cut_off_connection_is_repeated_on_other_connections(o
 
 
 @pytest.mark.usefixtures("way")
-async def test_a_late_answer_is_not_taken_for_another_request(one: Cluster) -> None:
+async def test_late_answer_is_not_used_for_the_next_request(one: Cluster) -> None:
     client, other = await connect(one.urls[0], {}), await connect(one.urls[0], {})
     asked: asyncio.Queue[str] = asyncio.Queue()
 
@@ -244,7 +244,7 @@ async def test_a_client_continues_to_read_after_a_late_pong(one: Cluster) -> Non
     await client.close()
 
 
-async def test_a_connection_that_is_no_longer_read_is_replaced(one: Cluster) -> None:
+async def test_connection_is_replaced_after_its_reading_task_has_ended(one: Cluster) -> None:
     async with connected_path(one) as path:
         former = path._client
         assert former

@@ -101,13 +101,13 @@ async def test_a_long_answer_is_not_requested_again_while_parts_arrive() -> None
     assert asked(paths) == [[0.0], []]
 
 
-async def test_a_read_that_fails_on_one_connection_uses_another_immediately() -> None:
+async def test_failed_read_is_repeated_immediately_on_another_connection() -> None:
     paths = [SlowPath("a", 0.0, failure=OutcomeUnknown("lost")), SlowPath("b", 0.01), SlowPath("c")]
     assert await answer(*paths) == ("b", 0.01)
 
 
 @pytest.mark.parametrize("number", [1, 2, 3])
-async def test_a_read_that_fails_on_all_connections_raises_immediately(number: int) -> None:
+async def test_read_raises_immediately_after_failing_on_all_connections(number: int) -> None:
     paths = [SlowPath("a", 0.01, failure=OutcomeUnknown("it ended with 503")) for _ in range(number)]
     with pytest.raises(OutcomeUnknown, match="503"):
         await answer(*paths)
@@ -121,7 +121,7 @@ async def test_a_forbidden_read_is_not_repeated() -> None:
     assert asked(paths) == [[0.0], []]
 
 
-async def test_a_read_whose_repeats_are_unanswered_raises() -> None:
+async def test_read_raises_if_all_repeats_are_unanswered() -> None:
     paths = [SlowPath("a"), SlowPath("b"), SlowPath("c")]
     with pytest.raises(OutcomeUnknown, match="no answer to questions"):
         await first_answer(paths, REQUEST, full())
@@ -150,13 +150,13 @@ async def questions(reads: int, paths: Sequence[LatePath], budget: RepeatBudget)
     return sum(map(len, asked(paths))) - before
 
 
-async def test_reads_are_not_repeated_before_timely_answers_were_seen() -> None:
+async def test_no_read_is_repeated_before_the_first_fast_answers() -> None:
     """Many gateways that start together slow down the servers, and repeats would slow them down more."""
     assert await questions(100, [LatePath(0.9) for _ in range(3)], RepeatBudget()) == 100
 
 
 @pytest.mark.slow
-async def test_reads_from_a_slow_cluster_are_not_repeated_for_long() -> None:
+async def test_repeated_reads_from_a_slow_cluster_are_limited() -> None:
     paths, budget = [LatePath(0.9) for _ in range(3)], full()
     assert 300 < await questions(300, paths, budget) < 300 + MOST_REPEATS
     assert await questions(300, paths, budget) == 300
@@ -175,7 +175,7 @@ async def test_occasional_late_answers_cause_few_repeated_reads(late: int) -> No
     assert count < 300 * (1 + EARNED)
 
 
-async def test_timely_answers_allow_more_repeated_reads() -> None:
+async def test_fast_answers_increase_the_budget_for_repeated_reads() -> None:
     paths, budget = [LatePath(0.9) for _ in range(3)], full()
     await questions(300, paths, budget)
     for path in paths:
@@ -185,7 +185,7 @@ async def test_timely_answers_allow_more_repeated_reads() -> None:
     assert await questions(1, paths, budget) == 3
 
 
-async def test_enough_reads_can_be_repeated_until_servers_drop_a_dead_route() -> None:
+async def test_budget_of_repeated_reads_lasts_until_a_dead_route_is_dropped() -> None:
     """In the 3 s until servers notice a dead route, a gateway sends about 100 reads and loses a third."""
     paths, budget = [LatePath(0.01) for _ in range(3)], full()
     loop = asyncio.get_running_loop()
@@ -316,7 +316,7 @@ async def test_buckets_change_their_leaders_before_a_silent_servers_next_electio
     assert HAND_OVER_S < ASKS_S
 
 
-async def test_a_bucket_changes_its_newly_elected_leader_while_a_server_is_silent(servers: Servers) -> None:
+async def test_elected_leader_is_changed_again_while_a_server_is_silent(servers: Servers) -> None:
     servers.silent = {"n3"}
     servers.leaders[names.LEASES[2]] = "n1"
     await servers.pass_s(1)
@@ -324,7 +324,7 @@ async def test_a_bucket_changes_its_newly_elected_leader_while_a_server_is_silen
     assert servers.leaders[names.LEASES[2]] == "n2"
 
 
-async def test_a_server_that_stays_silent_is_ignored_until_it_returns(servers: Servers) -> None:
+async def test_leaders_do_not_change_after_a_long_silence_of_a_server(servers: Servers) -> None:
     servers.silent = {"n3"}
     servers.leaders[names.LEASES[2]] = "n1"
     await servers.pass_s(round(SILENT_SERVER_S) + 5)
@@ -351,7 +351,7 @@ async def test_a_single_remaining_server_stays_the_leader_of_its_buckets(servers
     assert set(servers.terms.values()) == {1}
 
 
-async def test_a_leader_without_answers_delays_no_change_of_other_buckets_leaders(servers: Servers) -> None:
+async def test_other_leaders_are_found_quickly_if_one_leader_is_silent(servers: Servers) -> None:
     servers.silent = {"n2"}
     begun = asyncio.get_running_loop().time()
     clusters = await led_clusters(PATH)
@@ -375,7 +375,7 @@ async def test_raft_terms_rise_before_a_cut_off_server_starts_an_election(
     keeping.cancel()
 
 
-async def test_each_bucket_gets_back_the_leader_that_it_should_have(servers: Servers) -> None:
+async def test_bucket_leadership_returns_to_the_planned_server(servers: Servers) -> None:
     """Another server may lead a bucket, such as after a time in which a server was silent."""
     servers.leaders |= {"lease_0": "n2", "own_2": "n1"}
     servers.lagging = {"n1"}

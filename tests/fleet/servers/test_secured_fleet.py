@@ -105,7 +105,9 @@ def test_a_missing_right_is_reported_in_one_sentence(
 
 
 @pytest.mark.slow
-def test_samples_from_another_gateway_are_ignored(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_hub_ignores_samples_forged_by_another_gateway(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     """With one NATS account for all users, servers would send stored messages to any reply subject."""
 
     async def main(servers: SecuredCluster) -> None:
@@ -209,7 +211,7 @@ def test_no_data_is_sent_to_a_server_without_tls(run: Run, servers: SecuredClust
 
 
 @pytest.mark.long
-def test_a_client_without_tls_is_told_that_tls_is_required(run: Run, servers: SecuredCluster) -> None:
+def test_error_for_a_client_without_tls_says_that_tls_is_required(run: Run, servers: SecuredCluster) -> None:
     status, _, err = run("fleet", "status", "--nats", servers.urls[0].replace("tls://", "nats://"))
     assert status == 1
     assert "no answer in time; write tls:// if it requires TLS" in err
@@ -224,7 +226,9 @@ def test_a_client_trusts_only_certificates_of_the_given_authority(servers: Secur
 
 
 @pytest.mark.long
-def test_commands_without_a_quorum_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fleet_commands_report_a_missing_server_quorum(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with secured_cluster(tmp_path / "nats", 3) as servers:
         asyncio.run(make_streams(servers))
         for node in servers.nodes[1:]:

@@ -79,7 +79,7 @@ class Deaf:
     ("said", "has"),
     [(b'{"cluster":{"leader":"n2"}}', True), (b"{}", True), (b'{"cluster":{}}', False), (None, False)],
 )
-def test_lines_can_be_claimed_while_two_of_three_buckets_have_a_leader(said: bytes | None, has: bool) -> None:
+def test_two_buckets_need_leaders_before_lines_can_be_claimed(said: bytes | None, has: bool) -> None:
     for bucket in names.OWNERS:
         one: Any = Deaf(said, bucket)
         assert asyncio.run(have_leaders(one))
@@ -88,7 +88,7 @@ def test_lines_can_be_claimed_while_two_of_three_buckets_have_a_leader(said: byt
 
 
 @pytest.mark.slow
-def test_init_refuses_servers_that_accept_two_writes_to_one_revision(
+def test_init_refuses_old_servers_that_accept_two_writes_to_one_revision(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Old servers accept two concurrent writes to one revision. Their version is not checked in this test."""
@@ -99,7 +99,7 @@ def test_init_refuses_servers_that_accept_two_writes_to_one_revision(
             asyncio.run(initialised(old.urls))
 
 
-def test_init_refuses_servers_that_accept_the_writes_of_several_gateways(
+def test_init_refuses_servers_that_accept_concurrent_lease_writes(
     nats: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Such servers would grant a lease to two gateways. Some of their answers may arrive too late."""
@@ -110,7 +110,7 @@ def test_init_refuses_servers_that_accept_the_writes_of_several_gateways(
 
 @pytest.mark.slow
 @table(("is_carried_out",), [(True,), (False,)])
-def test_init_repeats_an_unanswered_removal_of_its_test_bucket(
+def test_init_retries_the_removal_of_the_test_bucket(
     is_carried_out: bool, nats: Cluster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """`init` removes the bucket of its test. A busy leader may answer too late."""
@@ -169,7 +169,9 @@ NO_LEADER = (
 
 
 @pytest.mark.slow
-def test_servers_that_cannot_decide_have_no_quorum(nats: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_init_reports_a_missing_quorum_if_jetstream_is_unavailable(
+    nats: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(setup, "WAIT_S", 0.5)
 
     async def refuse(self: ServerPath, subject: str, *rest: object, **more: object) -> SimpleNamespace:
@@ -267,7 +269,7 @@ async def _check(fleet: Cluster) -> None:
 
 
 @pytest.mark.long
-async def test_a_connection_uses_another_server_until_its_own_one_answers_again(tmp_path: Path) -> None:
+async def test_connection_returns_to_the_preferred_server_after_an_outage(tmp_path: Path) -> None:
     with cluster(tmp_path, 3) as three:
         path = paths_of(three.urls)[1]
         await path.open()
@@ -287,7 +289,7 @@ async def test_a_connection_uses_another_server_until_its_own_one_answers_again(
 
 
 @pytest.mark.long
-async def test_a_connection_whose_own_server_is_silent_uses_another_one(tmp_path: Path) -> None:
+async def test_connection_uses_another_server_if_the_preferred_one_is_silent(tmp_path: Path) -> None:
     with cluster(tmp_path, 2) as two:
         two.nodes[0].pause()
 
@@ -352,7 +354,7 @@ def as_text(line: Any) -> str:
     )
 
 
-def test_the_lines_in_stored_records_equal_the_lines_in_the_plant_file(tmp_path: Path) -> None:
+def test_stored_line_records_give_the_same_lines_as_the_plant_file(tmp_path: Path) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(PLANT, "utf-8")
     again = lines_again(path, tmp_path / "gateway")
