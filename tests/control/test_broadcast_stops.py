@@ -58,12 +58,12 @@ def broadcasts(line: SimulatedBus) -> list[Message]:
     return [request for request, _ in line.frames if request.address == 0]
 
 
-def test_all_families_but_the_erman_have_broadcasts() -> None:
+def test_every_family_except_the_erman_declares_a_broadcast() -> None:
     assert set(BROADCASTING) == set(MODELS) - {"erman-er-g-220"}
 
 
 @every_broadcasting
-def test_no_stop_is_broadcast_if_families_differ(model: str) -> None:
+def test_a_stop_is_not_broadcast_to_drives_of_different_families(model: str) -> None:
     """One family's stop may start a motor of the other family. Both orders of the drives are tested."""
     models = deque(MAKE)
     models.rotate(-models.index(model))
@@ -89,12 +89,12 @@ def test_a_stop_is_broadcast_if_all_drives_are_of_one_family(model: str) -> None
     assert (sent.start, sent.data) == (line.frames[-2][0].start, line.frames[-2][0].data)
 
 
-def test_no_stop_is_broadcast_if_the_family_defines_no_broadcast() -> None:
+def test_a_stop_is_not_broadcast_to_a_family_without_broadcasts() -> None:
     check_stopped_without_broadcast("erman-er-g-220", "erman-er-g-220")
 
 
 @pytest.mark.parametrize("models", [("erman-er-g-220", "erman-er-g-220"), ("invt-che", "yd1000")])
-def test_a_stop_has_failed_if_neither_it_nor_a_broadcast_was_sent(models: tuple[str, str]) -> None:
+def test_stop_all_reports_failed_if_the_port_does_not_exist(models: tuple[str, str]) -> None:
     line, _, _ = line_of(*models)
 
     line.fails = lambda request: PortLost("hall", "there is no such port")
@@ -128,7 +128,8 @@ class Quiet(Toy):
 
 
 @pytest.mark.parametrize("confirmed", [0, 1])
-def test_a_harmless_broadcast_is_not_sent_as_a_stop(confirmed: int) -> None:
+def test_stop_all_does_not_broadcast_a_zero_setpoint(confirmed: int) -> None:
+    """A setpoint of 0 is the only broadcast of this family, but does not stop a motor."""
     drives = [Quiet(address, confirmed=confirmed) for address in (1, 2)]
     line = SimulatedBus(*(simulated(drive) for drive in drives))
     for drive in drives:
@@ -162,7 +163,7 @@ def test_a_broadcast_stop_does_not_wait_for_late_replies(monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize("is_sent", [False, True])
-def test_a_failed_broadcast_counts_as_sent_only_if_bytes_were_sent(tmp_path: Path, is_sent: bool) -> None:
+def test_a_broadcast_counts_as_sent_if_the_port_fails_after_sending(tmp_path: Path, is_sent: bool) -> None:
     audit = tmp_path / "audit"
     sims = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2)]
     line = SimulatedBus(*sims, audit=audit)
@@ -198,7 +199,7 @@ def test_a_broadcast_is_refused_if_one_drive_is_of_another_family(address: int) 
 
 @every_broadcasting
 @pytest.mark.parametrize("frames", every_third(range(1, 12)))
-def test_a_start_called_before_a_broadcast_stop_is_not_sent_after_it(model: str, frames: int) -> None:
+def test_a_broadcast_stop_cancels_a_start_in_progress(model: str, frames: int) -> None:
     line, drives, _ = line_of(model, model)
     drives[0].set_frequency(20)
     begun = len(line.frames)
@@ -226,7 +227,7 @@ def setpoint_of(drive: Any) -> Any:
 
 
 @table("model", SETTING)
-def test_a_bus_broadcasts_nothing_but_stops_after_leave(model: str) -> None:
+def test_only_stops_can_be_broadcast_after_leave_is_called(model: str) -> None:
     line, drives, _ = line_of(model, model)
     assert 0 in setpoint_of(drives[0]).broadcast
     line.bus.leave()
@@ -291,7 +292,7 @@ def test_a_setpoint_is_not_broadcast_if_a_drive_may_have_been_replaced() -> None
     assert line.written == []
 
 
-def test_a_stop_that_was_only_broadcast_is_reported_as_sent() -> None:
+def test_a_broadcast_stop_counts_as_sent_if_the_port_is_then_lost() -> None:
     """The port is lost after the broadcast, so no stop is sent to a single drive."""
     line, _, _ = line_of("invt-che", "invt-che")
     lost = PortLost("hall", "the port was lost (hung up)")
@@ -301,7 +302,7 @@ def test_a_stop_that_was_only_broadcast_is_reported_as_sent() -> None:
         assert "sent 1 times, it was never confirmed" in told.why
 
 
-def test_the_note_on_an_interruption_counts_the_broadcast_stop() -> None:
+def test_keyboard_interrupt_notes_count_the_broadcast_stop() -> None:
     line, _, _ = line_of("invt-che", "invt-che")
 
     line.fails = lambda request: KeyboardInterrupt() if broadcasts(line) and request.address else None
@@ -311,7 +312,7 @@ def test_the_note_on_an_interruption_counts_the_broadcast_stop() -> None:
     assert {*interruption.value.__notes__} == {f"invt-che@1: {told}", f"invt-che@2: {told}"}
 
 
-def test_a_broadcast_allows_only_a_stop_or_a_zero_setpoint() -> None:
+def test_only_stops_and_zero_setpoints_can_be_broadcast() -> None:
     """A line with drives of two families allows no broadcast."""
     sims = [simulated(InvtCHE(1)), simulated(InvtCHE(2))]
     line = SimulatedBus(*sims)
@@ -334,7 +335,7 @@ def test_a_broadcast_allows_only_a_stop_or_a_zero_setpoint() -> None:
     assert len(line.written) == 1
 
 
-def test_a_drive_that_is_unreadable_after_a_broadcast_is_reported() -> None:
+def test_a_broadcast_returns_an_error_for_each_silent_drive() -> None:
     sims = [simulated(InvtCHE(1)), simulated(InvtCHE(2))]
     line = SimulatedBus(*sims)
     for sim in sims:
@@ -369,7 +370,7 @@ def test_a_broadcast_is_followed_by_the_turnaround_delay(monkeypatch: pytest.Mon
     assert driver.now == over + 100 * MS
 
 
-def test_each_drive_is_checked_after_a_broadcast_stop() -> None:
+def test_each_motor_is_seen_to_stop_after_a_broadcast() -> None:
     line, _, sims = che_drives(3, runs_s=1)
     begun = len(line.frames)
     stopped = line.bus.stop_all()
@@ -391,7 +392,7 @@ def test_each_drive_is_stopped_if_the_broadcast_fails() -> None:
     assert all_stopped(line, sims)
 
 
-def test_the_result_of_stop_all_has_each_drive() -> None:
+def test_stop_all_returns_a_result_for_each_drive() -> None:
     sims: list[Any] = [
         simulated(InvtCHE(1, maximum_frequency=50)),
         simulated(ErmanERG220(2)),

@@ -74,7 +74,7 @@ def losing(*functions: int) -> Callable[[bytes], bytes]:
 
 
 @patient
-def test_a_value_is_read_in_its_unit() -> None:
+def test_a_read_returns_the_scaled_value() -> None:
     rig = simulated(Rig(1))
     rig["torque"] = 33.3
     with unpaced(rig) as sim, Bus(path(sim)) as bus:
@@ -125,7 +125,7 @@ def test_all_readings_take_as_few_requests_as_the_family_allows(family: type[Dri
 
 @pytest.mark.slow
 @patient
-def test_all_families_are_read_at_their_own_baud_rate_and_format() -> None:
+def test_drives_with_different_baud_rates_and_formats_share_one_bus() -> None:
     drives = [
         ErmanERG220(1),
         InvtCHE(2, baudrate=19200, format="8E1"),
@@ -142,7 +142,7 @@ def test_all_families_are_read_at_their_own_baud_rate_and_format() -> None:
             assert ours.read(register) == proof(ours, register)
 
 
-def test_a_drive_without_line_settings_uses_those_of_its_bus() -> None:
+def test_a_drive_uses_the_line_settings_of_the_bus_by_default() -> None:
     with unpaced(simulated(Toy(1))) as sim, Bus(path(sim), baudrate=19200, format="8N2") as bus:
         assert str(bus.attach(Toy, 1).settings) == "19200 8N2"
         assert str(bus.attach(Toy, 2, baudrate=9600).settings) == "9600 8N2"
@@ -157,7 +157,7 @@ def test_a_drive_cannot_be_attached_to_a_closed_bus() -> None:
 
 
 @patient
-def test_the_silence_of_a_bus_is_used_by_drives_without_their_own() -> None:
+def test_drives_use_the_silence_of_the_bus_by_default() -> None:
     """One bit time is added to the silence of the bus, as to the standard's t3.5."""
     drives = [simulated(ErmanERG220(at, silence=600e-6)) for at in (1, 2)]
     with Simulator([Wire(drives)]) as sim, Bus(sim.wires[0].path, silence=600e-6) as bus:
@@ -173,7 +173,7 @@ def test_the_silence_of_a_bus_is_used_by_drives_without_their_own() -> None:
 
 
 @patient
-def test_a_value_that_the_eeprom_already_holds_is_not_written() -> None:
+def test_a_write_is_skipped_if_the_eeprom_holds_the_value() -> None:
     rig = simulated(Rig(1))
     rig["limit"] = 10.0
     with unpaced(rig) as sim, Bus(path(sim)) as bus:
@@ -331,7 +331,7 @@ def half_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.slow
-def test_a_write_without_reply_or_readable_register_is_unconfirmed() -> None:
+def test_a_write_to_a_write_only_register_is_unconfirmed_without_a_reply() -> None:
     rig = simulated(Rig(1))
     with faulty(rig, losing(0x06)) as sim, Bus(path(sim)) as bus:
         ours = bus.attach(Rig, 1)
@@ -344,7 +344,7 @@ def test_a_write_without_reply_or_readable_register_is_unconfirmed() -> None:
 
 
 @pytest.mark.slow
-def test_a_write_on_a_line_without_replies_is_sent_once() -> None:
+def test_a_write_is_sent_at_most_once_if_the_drive_never_replies() -> None:
     rig = simulated(Rig(1))
     with faulty(rig, losing(0x03, 0x06)) as sim, Bus(path(sim)) as bus:
         ours = bus.attach(Rig, 1)
@@ -423,7 +423,7 @@ WRONG_ECHOES = {
 
 @pytest.mark.long
 @pytest.mark.parametrize("wrong", WRONG_ECHOES)
-def test_a_wrong_confirmation_confirms_nothing(wrong: str) -> None:
+def test_a_write_is_unconfirmed_if_the_reply_does_not_match(wrong: str) -> None:
     echo = checksums.rtu(WRONG_ECHOES[wrong])
 
     def fate(reply: bytes) -> bytes:
@@ -574,7 +574,7 @@ def test_a_new_drive_at_a_used_address_expects_late_replies_of_the_old_drive() -
 
 
 @pytest.mark.parametrize("wrong", ["audit", "ledger"])
-def test_a_bus_with_invalid_arguments_leaves_no_port_open(wrong: str) -> None:
+def test_the_port_is_closed_if_the_bus_arguments_are_invalid(wrong: str) -> None:
     with Simulator([Wire([simulated(Toy(1))])]) as simulator:
         port = simulator.wires[0].path
         with pytest.raises(TypeError) as kept:

@@ -57,7 +57,7 @@ STOPS: dict[str, Stop] = {
 
 
 @table("way", STOPS)
-def test_a_stop_has_the_outcome_done_unknown_or_failed(way: str) -> None:
+def test_the_outcome_of_a_stop_depends_on_the_reply(way: str) -> None:
     _, drive, _ = one(InnovertIBD(1))
     assert STOPS[way](drive)[drive.name].ok
     line, drive, _ = one(InnovertIBD(1))
@@ -72,21 +72,21 @@ def test_a_stop_has_the_outcome_done_unknown_or_failed(way: str) -> None:
     assert line.written
 
 
-def test_a_stop_of_a_removed_line_has_the_outcome_unknown_for_each_drive() -> None:
+def test_stopping_a_removed_line_returns_unknown_for_each_drive() -> None:
     def gone() -> None:
         raise KeyError("hall")
 
     assert [one.outcome for one in stop_line(gone, ["a", "b"], None).values()] == [CommandOutcome.UNKNOWN] * 2
 
 
-def test_the_stop_of_a_removed_drive_is_not_sent() -> None:
+def test_stopping_a_removed_drive_returns_not_sent() -> None:
     line = SimulatedBus(simulated(InvtCHE(1)))
     found = stop_line(lambda: line.bus, ["gone"], None)
     assert found["gone"].outcome is CommandOutcome.NOT_SENT
     assert isinstance(found["gone"].error, NotAttached)
 
 
-def test_a_command_to_a_drive_without_a_line_is_not_sent() -> None:
+def test_a_command_to_an_unattached_drive_is_not_sent() -> None:
     drive = InvtCHE(1, name="mill", maximum_frequency=50)
     for result in (carry_out_verb(drive, "start", {}), write_register(drive, "setpoint", 10.0)):
         assert result.outcome is CommandOutcome.NOT_SENT
@@ -101,7 +101,9 @@ def test_a_command_to_a_drive_without_a_line_is_not_sent() -> None:
         ("ten", CommandOutcome.REFUSED, "setpoint"),
     ],
 )
-def test_a_write_returns_a_result_and_never_raises(value: Any, outcome: CommandOutcome, text: str) -> None:
+def test_write_register_returns_a_result_instead_of_raising(
+    value: Any, outcome: CommandOutcome, text: str
+) -> None:
     _, mill, _ = one(InvtCHE(1, name="mill", maximum_frequency=50))
     result = write_register(mill, "setpoint", value)
     assert result.outcome is outcome, result
@@ -162,7 +164,7 @@ async def test_all_stops_are_sent_before_any_is_repeated(threads: Threads, failu
 
 
 @pytest.mark.slow
-def test_the_event_loop_is_not_blocked_by_stops_without_threads(threads: Threads) -> None:
+def test_the_event_loop_continues_while_stops_run_without_threads(threads: Threads) -> None:
     motors = Motors(a=3, b=2)
     turns = 0
 
@@ -181,7 +183,7 @@ def test_the_event_loop_is_not_blocked_by_stops_without_threads(threads: Threads
     assert turns > 2
 
 
-async def test_the_result_of_a_stop_without_effect_is_unknown(
+async def test_a_stop_returns_unknown_if_the_motor_does_not_stop(
     threads: Threads, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(commands, "STOP_S", 0.0)
@@ -254,7 +256,7 @@ def on_threads(works: Sequence[StopWork]) -> list[StopFuture]:
     return [asyncio.get_running_loop().run_in_executor(None, work, None) for work in works]
 
 
-async def test_a_further_stop_is_sent_once_while_the_first_is_repeated() -> None:
+async def test_a_second_stop_is_sent_once_while_the_first_is_repeated() -> None:
     pump, stops = NotedStops(), RepeatedStops(stop_noted, on_threads)
     drive: Any = pump
     repeated = asyncio.get_running_loop().create_future()
@@ -293,7 +295,7 @@ async def test_a_second_stop_is_repeated_after_the_first_has_given_up() -> None:
     assert (await called)["pump"].ok is False
 
 
-def test_a_repeated_stop_is_in_progress_from_its_call_to_its_end() -> None:
+def test_a_repeated_stop_is_found_only_while_in_progress() -> None:
     async def live() -> None:
         pump, stops = NotedStops(), RepeatedStops(stop_noted, on_threads)
         drive: Any = pump
@@ -319,7 +321,7 @@ def test_a_repeated_stop_is_in_progress_from_its_call_to_its_end() -> None:
     run_controlled(live())
 
 
-def test_the_drives_with_a_repeated_stop_are_listed_separately() -> None:
+def test_drives_with_and_without_a_repeated_stop_are_separated() -> None:
     async def live() -> None:
         stops = RepeatedStops(stop_noted, on_threads)
         drives: list[Any] = [NotedStops(), NotedStops(), NotedStops()]
@@ -334,7 +336,7 @@ def test_the_drives_with_a_repeated_stop_are_listed_separately() -> None:
     run_controlled(live())
 
 
-def test_a_repeated_stop_splits_the_stop_of_its_line() -> None:
+def test_a_line_stop_is_split_if_one_drive_is_already_being_stopped() -> None:
     async def live() -> None:
         wholes: list[float | None] = []
 
@@ -389,19 +391,19 @@ class TimedStops:
         return told
 
 
-def test_a_stop_after_an_unsuccessful_stop_returns_its_own_result() -> None:
+def test_a_second_stop_succeeds_after_the_first_has_given_up() -> None:
     timed = TimedStops(NotedStops(), 0)
     assert run_controlled(timed.called_beside(10.0)) == STANDS
     assert timed.calls == [0.0, None]
 
 
-def test_a_stop_is_not_repeated_after_its_time_limit() -> None:
+def test_a_second_stop_is_not_repeated_after_the_time_limit() -> None:
     timed = TimedStops(NotedStops(), 0)
     assert run_controlled(timed.called_beside(REPEATED_S + 1)) == SILENT
     assert timed.calls == [0.0]
 
 
-def test_a_flood_of_stop_requests_is_joined_into_one_later_stop() -> None:
+def test_excess_stop_requests_share_one_later_stop() -> None:
     async def main() -> None:
         stops, begun, silent = JoinedStops(), list[int](), asyncio.Event()
 

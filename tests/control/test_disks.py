@@ -41,7 +41,7 @@ def writes(ledger: Ledger) -> int:
 
 
 @pytest.mark.parametrize("room", range(0, 90, 10))
-def test_a_record_on_a_full_disk_damages_no_other_record(tmp_path: Path, room: int) -> None:
+def test_a_full_disk_does_not_damage_other_audit_records(tmp_path: Path, room: int) -> None:
     path = tmp_path / "audit.jsonl"
     log, other = AuditLog(path), AuditLog(path)  # `other` is the log of another process
     log.add(0, {"write": "first"})
@@ -58,7 +58,7 @@ def test_a_record_on_a_full_disk_damages_no_other_record(tmp_path: Path, room: i
     assert sum(not _is_record(line) for line in whole) == (1 if room else 0)
 
 
-def test_reading_the_audit_log_skips_lines_that_are_not_records(tmp_path: Path) -> None:
+def test_read_audit_skips_invalid_lines(tmp_path: Path) -> None:
     path = tmp_path / "audit.jsonl"
     path.write_bytes(b'{"write": "a"}\n' + b"[" * 100_000 + b"\n[1]\n\xff\n" + b'{"write": "b"}\n{"write')
     assert [record["write"] for record in read_audit(path)] == ["a", "b"]
@@ -129,8 +129,8 @@ def test_a_stop_is_sent_despite_a_full_disk(tmp_path: Path, caplog: pytest.LogCa
     ]
 
 
-def test_a_full_disk_prevents_writes_that_must_be_recorded_first(tmp_path: Path) -> None:
-    """Stops are sent nevertheless."""
+def test_a_full_disk_prevents_writes_but_not_stops(tmp_path: Path) -> None:
+    """In a `noted_first` block, each write must be recorded before it is sent."""
     path = tmp_path / "audit.jsonl"
     line = SimulatedBus(simulated(InvtCHE(1, maximum_frequency=50)), audit=path)
     drive = line.attach(InvtCHE(1, maximum_frequency=50))
@@ -221,7 +221,7 @@ def test_an_audit_log_on_a_hung_disk_times_out(monkeypatch: pytest.MonkeyPatch, 
     answers.set()
 
 
-def test_an_audit_log_in_a_read_only_directory_is_refused_before_anything_is_sent() -> None:
+def test_an_audit_log_in_a_read_only_directory_is_refused() -> None:
     with read_only_directory() as directory, pytest.raises(PermissionError, match=r"audit\.jsonl"):
         one(InvtCHE(1), audit=directory / "audit.jsonl")
 
@@ -241,7 +241,7 @@ def test_the_eeprom_ledger_refuses_writes_while_the_disk_is_full(tmp_path: Path,
 
 
 @pytest.mark.parametrize("room", [0, 512, 4096, 8192])
-def test_an_eeprom_ledger_created_on_a_full_disk_works_when_there_is_room(tmp_path: Path, room: int) -> None:
+def test_the_eeprom_ledger_works_once_a_full_disk_has_room_again(tmp_path: Path, room: int) -> None:
     ledger = Ledger(tmp_path / "wear.sqlite")
     with full_at(room), pytest.raises(OSError, match="cannot be kept"):
         ledger.enter(CELL, NOON, 0.0)
@@ -279,7 +279,7 @@ def test_a_clock_set_back_by_a_quarter_second_allows_one_additional_eeprom_write
     assert "was written 0 s ago" in ledger.enter(CELL, 999.75, 60.0)
 
 
-def test_the_ledger_counts_all_writes_of_a_stop_or_none_of_them(tmp_path: Path) -> None:
+def test_all_eeprom_writes_of_a_stop_are_counted_in_one_transaction(tmp_path: Path) -> None:
     """All writes are one transaction, because each transaction may wait for the disk or another process."""
     ledger = Ledger(tmp_path / "wear")
     wrong = replace(CELL, register="no text: \udcff")

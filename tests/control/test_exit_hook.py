@@ -125,7 +125,7 @@ def test_a_third_signal_within_a_second_ends_the_wait_for_stops(
     assert len(caught) == 1
 
 
-def test_a_third_signal_ends_the_wait_without_standard_error(
+def test_a_third_signal_ends_the_wait_although_standard_error_fails(
     caught: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Standard error may be closed, or its terminal may be gone."""
@@ -144,7 +144,7 @@ def test_a_third_signal_ends_the_wait_without_standard_error(
     until(lambda: exit_threads() <= others)
 
 
-def test_a_repeated_hang_up_signal_does_not_end_the_wait(caught: list[int]) -> None:
+def test_a_repeated_sighup_does_not_end_the_wait_for_stops(caught: list[int]) -> None:
     """The kernel and the shell may each send SIGHUP when a terminal closes."""
     before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
     try:
@@ -164,7 +164,7 @@ def test_a_repeated_hang_up_signal_does_not_end_the_wait(caught: list[int]) -> N
 
 
 @pytest.mark.parametrize("has", [signal.SIG_IGN, lambda number, frame: None], ids=["nohup", "its own"])
-def test_sighup_is_not_handled_if_the_program_handles_or_ignores_it(caught: list[int], has: Any) -> None:
+def test_the_sighup_setting_of_the_program_is_not_replaced(caught: list[int], has: Any) -> None:
     before = signal.signal(signal.SIGHUP, has)
     try:
         hook = ExitHook()
@@ -191,7 +191,7 @@ def test_a_failing_exit_task_is_logged(caught: list[int], caplog: pytest.LogCapt
     assert "the drives could not be stopped" in caplog.text
 
 
-def test_an_exit_task_may_be_finished_on_any_thread(caught: list[int]) -> None:
+def test_an_exit_task_can_be_finished_on_another_thread(caught: list[int]) -> None:
     hook, act = ExitHook(), Act()
     made = hook.add(act.begin, act.work)
     act.go_on.set()
@@ -257,7 +257,7 @@ def test_an_exit_task_is_refused_if_no_signal_handler_can_be_installed(
     assert not acts[1].is_begun
 
 
-def test_our_handler_calls_the_earlier_one_after_the_bus_was_closed(caught: list[int]) -> None:
+def test_the_library_signal_handler_calls_the_previous_handler_after_close(caught: list[int]) -> None:
     """Another program part replaces our handler, and installs it again after the bus was closed."""
     hook = ExitHook()
     for comes_again in (False, True):
@@ -274,7 +274,7 @@ def test_our_handler_calls_the_earlier_one_after_the_bus_was_closed(caught: list
 
 
 @pytest.mark.parametrize("is_over", [True, False], ids=["the first bus is closed", "the first bus is open"])
-def test_a_later_bus_handles_signals_that_the_program_took_over(caught: list[int], is_over: bool) -> None:
+def test_a_new_bus_stops_motors_before_the_programs_handler_runs(caught: list[int], is_over: bool) -> None:
     """The first bus is still open, or was closed on a thread, which cannot restore signal handlers."""
     hook, acts, handled = ExitHook(), [Act(), Act()], list[int]()
     first = hook.add(acts[0].begin, acts[0].work)
@@ -294,7 +294,7 @@ def test_a_later_bus_handles_signals_that_the_program_took_over(caught: list[int
 
 
 @pytest.mark.parametrize("effect", ["called", "default", "ignored"])
-def test_a_later_handler_of_the_program_may_call_ours(caught: list[int], effect: str) -> None:
+def test_a_signal_handler_of_the_program_may_call_the_library_handler(caught: list[int], effect: str) -> None:
     """The program has replaced our handler. After the stops, the handler before ours is called once."""
     hook, act, handled = ExitHook(), Act(), list[int]()
     if effect != "called":
@@ -314,7 +314,7 @@ def test_a_later_handler_of_the_program_may_call_ours(caught: list[int], effect:
     assert caught == ([signal.SIGTERM] if effect == "called" else [])
 
 
-def test_a_handler_that_we_have_replaced_may_call_ours(caught: list[int]) -> None:
+def test_a_replaced_signal_handler_may_still_call_the_library_handler(caught: list[int]) -> None:
     hook, handled = ExitHook(), list[int]()
     hook.add(lambda: None, lambda: None)
     ours: Any = signal.getsignal(signal.SIGTERM)
@@ -389,7 +389,9 @@ def test_a_delayed_signal_is_forwarded_only_once(caught: list[int], monkeypatch:
     signal.raise_signal(sent[-1])
 
 
-def test_a_signal_prints_the_stopped_drives(caught: list[int], capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_signal_prints_the_names_of_the_drives_being_stopped(
+    caught: list[int], capfd: pytest.CaptureFixture[str]
+) -> None:
     hook, acts = ExitHook(), [Act(), Act()]
     names = [["pump"], [f"fan-{number}" for number in range(25)]]
     for act, drives in zip(acts, names, strict=True):
@@ -512,7 +514,7 @@ def test_a_second_signal_leaves_no_motor_running(number: int) -> None:
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_a_signal_while_the_with_block_ends_leaves_no_motor_running() -> None:
+def test_all_motors_stop_if_sigterm_arrives_as_the_with_block_ends() -> None:
     with lines(1) as (received, ports), client("leave", ports) as process:
         until(lambda: stops(received[0]))
         process.send_signal(signal.SIGTERM)
@@ -522,7 +524,7 @@ def test_a_signal_while_the_with_block_ends_leaves_no_motor_running() -> None:
 
 
 @pytest.mark.long
-def test_a_second_bus_does_not_wait_for_the_ramps_of_the_first() -> None:
+def test_motors_of_two_buses_are_stopped_in_parallel() -> None:
     with lines(2) as (received, ports), client("wait", ports) as process:
         turning_at_last_stop: list[bool] = []
         for one, others in (received, received[::-1]):
@@ -566,7 +568,7 @@ def test_a_poller_stops_the_drives_of_all_its_lines(monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.parametrize("leaves", ["poller", "line"])
-def test_a_poller_restores_the_handlers_that_its_bus_replaced(caught: list[int], leaves: str) -> None:
+def test_signal_handlers_are_restored_when_a_poller_or_line_closes(caught: list[int], leaves: str) -> None:
     drive = InvtCHE(1, maximum_frequency=50, name="pump")
     before = signal.getsignal(signal.SIGTERM)
     with lines(1) as (received, (port,)):

@@ -194,9 +194,7 @@ def check(cell: Cell, situation: str, verb: str, fault: str, outcome: str) -> No
 # The short run tries each cell of TABLE on a third of the built-in families.
 @pytest.mark.parametrize("part", usually(0, 1, 2, 3), ids=["a third", "another", "the last", "profiles"])
 @pytest.mark.parametrize("cell", CELLS)
-def test_a_verb_has_the_tabulated_outcome_during_a_fault(
-    part: int, cell: tuple[str, str, str, str, int]
-) -> None:
+def test_verb_outcomes_during_faults_equal_the_table(part: int, cell: tuple[str, str, str, str, int]) -> None:
     situation, verb, fault, expected, first_third = cell
     families = [*PROFILES] if part == 3 else [*MAKE][(first_third + part) % 3 :: 3]
     first, _, second = expected.partition("/")

@@ -93,7 +93,9 @@ def test_no_write_is_sent_after_the_drive_was_replaced(monkeypatch: pytest.Monke
 
 @pytest.mark.slow
 @pytest.mark.parametrize("model", MAKE)
-def test_a_silent_drive_is_identified_before_a_write(model: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_drive_is_identified_before_a_write_if_replies_were_missing(
+    model: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(records, "LEAST_INTERVAL", 0.0)  # seconds between EEPROM writes of one register
     with known(model) as (bus, drive, received):
         looks: list[str] = []
@@ -137,7 +139,7 @@ def test_a_drive_is_identified_again_after_10_s_of_silence(
 @pytest.mark.usefixtures("_turns_awaited")
 @pytest.mark.parametrize("model", MAKE)
 @pytest.mark.parametrize("is_silent", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_a_stop_after_an_idle_or_silent_time_is_sent_without_a_read(model: str, is_silent: bool) -> None:
+def test_a_stop_is_sent_before_any_read_after_a_long_pause(model: str, is_silent: bool) -> None:
     with known(model) as (bus, drive, received):
         drive.set_frequency(10)
         drive.start()
@@ -194,7 +196,7 @@ LOSSES = [_asleep, _idle, _idle_and_asleep, _read_since, _on_another_port, _on_a
 @pytest.mark.usefixtures("_turns_awaited")
 @pytest.mark.parametrize("model", ["innovert-ibd", "delixi-native"])
 @pytest.mark.parametrize("lose", [*LOSSES, pytest.param(_silent_then_idle, marks=pytest.mark.slow)])
-def test_an_unreadable_setpoint_is_forgotten_after_a_possible_power_loss(
+def test_a_start_after_a_possible_power_loss_needs_a_new_setpoint(
     model: str, lose: Callable[..., None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with known(model) as (bus, drive, received):
@@ -241,7 +243,7 @@ def test_a_poll_without_a_reply_counts_as_silence() -> None:
     assert received.writes == []
 
 
-def test_a_detached_drive_is_identified_again_before_a_start() -> None:
+def test_a_reattached_drive_is_identified_again_before_a_start() -> None:
     bus, drive, sim = one(InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(10)
     bus.bus.detach(drive)
@@ -252,7 +254,7 @@ def test_a_detached_drive_is_identified_again_before_a_start() -> None:
     assert len(bus.written) == 1
 
 
-def test_a_detached_drive_is_identified_again_before_a_stop() -> None:
+def test_a_reattached_drive_is_identified_again_before_a_stop() -> None:
     """Sending a stop does not confirm the drive's identity for a start."""
     bus, drive, sim = one(InvtCHE(1, maximum_frequency=50))
     odd = [build_reply(Framing.RTU, Message(1, 3, data=bytes([0, device]))) for device in (3, 4)]
@@ -267,7 +269,7 @@ def test_a_detached_drive_is_identified_again_before_a_stop() -> None:
     assert len(bus.written) == begun
 
 
-def test_detaching_a_drive_forgets_that_its_identity_check_failed() -> None:
+def test_detaching_a_drive_clears_failed_identity_checks() -> None:
     bus, drive, sim = one(InvtCHE(1, maximum_frequency=50))
     sim["device"] = GOODRIVE
     check = bus.bus._writer.identity_check
@@ -320,7 +322,7 @@ def test_a_read_is_sent_immediately_before_the_first_stop(
 
 
 @pytest.mark.parametrize("is_in_step", [True, False])
-def test_an_identity_check_with_late_replies_confirms_no_drive(is_in_step: bool) -> None:
+def test_identity_is_not_confirmed_while_replies_may_be_late(is_in_step: bool) -> None:
     bus, drive, _ = one(InvtCHE(1, maximum_frequency=50))
 
     def fall_out_of_step(request: Message) -> bytes | None:
@@ -334,7 +336,7 @@ def test_an_identity_check_with_late_replies_confirms_no_drive(is_in_step: bool)
     assert bus.bus.knows_identity(drive) is is_in_step
 
 
-def test_an_identity_check_by_undocumented_registers_never_withholds_a_stop() -> None:
+def test_a_stop_is_sent_although_the_drive_answers_like_an_innovert_ibd() -> None:
     """The `identify` of InnovertIBD reads registers that its manual does not document."""
     bus = SimulatedBus(simulated(InnovertIBD(1)))
     bus.attach(InvtCHE(1))
@@ -346,7 +348,7 @@ def test_an_identity_check_by_undocumented_registers_never_withholds_a_stop() ->
 
 
 @pytest.mark.parametrize(("share", "looks"), [(0.6, 0), (1.1, 1)])
-def test_a_drive_that_answered_recently_is_not_identified_again(share: float, looks: int) -> None:
+def test_identity_is_not_checked_again_if_the_drive_answered_recently(share: float, looks: int) -> None:
     bus, drive, _ = one(InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(10)
     bus.sleep(share * PAUSE_NS / 1e9)
@@ -367,7 +369,7 @@ REFUSALS = [
 
 
 @table(("model", "code"), REFUSALS)
-def test_a_stop_is_sent_if_the_check_gets_an_exception_reply(model: str, code: int) -> None:
+def test_a_stop_is_sent_if_the_identity_check_gets_an_exception_reply(model: str, code: int) -> None:
     line, drive, sim = one(MAKE[model](1))
     sim.motor.energised = True
 
@@ -381,7 +383,7 @@ def test_a_stop_is_sent_if_the_check_gets_an_exception_reply(model: str, code: i
 
 
 @table("model", MAKE)
-def test_a_stop_and_its_check_await_no_late_reply(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
+def test_the_first_stop_does_not_wait_for_late_replies(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
     line, drive, _ = one(MAKE[model](1))
     insisted: list[bool] = []
     carry_out = line.carry_out
@@ -398,7 +400,7 @@ def test_a_stop_and_its_check_await_no_late_reply(monkeypatch: pytest.MonkeyPatc
 
 
 @table("model", MAKE)
-def test_a_lost_identity_check_is_not_repeated_before_the_stop(model: str) -> None:
+def test_a_stop_is_sent_after_one_unanswered_identity_check(model: str) -> None:
     line, drive, _ = one(MAKE[model](1))
     line.loses = lambda request: not writes(line)
     drive.stop()
@@ -406,7 +408,7 @@ def test_a_lost_identity_check_is_not_repeated_before_the_stop(model: str) -> No
 
 
 @pytest.mark.parametrize("codes", [(3,), (3, 4)])
-def test_a_stop_is_sent_unless_two_replies_show_the_same_family(codes: tuple[int, ...]) -> None:
+def test_a_stop_is_sent_unless_the_same_wrong_identity_is_read_twice(codes: tuple[int, ...]) -> None:
     line, drive, _ = one(InvtCHE(1))
     odd = [build_reply(Framing.RTU, Message(1, 3, data=bytes([0, code]))) for code in codes]
     line.answers = lambda request: odd.pop(0) if odd else None
@@ -415,7 +417,7 @@ def test_a_stop_is_sent_unless_two_replies_show_the_same_family(codes: tuple[int
     assert STOPS["invt-che"](writes(line)[0])
 
 
-def test_a_stop_is_never_refused_after_a_missing_reply() -> None:
+def test_a_stop_is_sent_after_a_missing_reply_despite_a_wrong_identity() -> None:
     """The drive's next reply may belong to an earlier request."""
     line, drive, sim = one(InvtCHE(1))
     sim["device"] = 0x010A
@@ -424,7 +426,7 @@ def test_a_stop_is_never_refused_after_a_missing_reply() -> None:
     assert line.frames[0][1] == "01 06 10 00 00 05 4D 09"  # the stop is sent first, without an identity check
 
 
-def test_the_error_of_a_withheld_stop_says_what_to_do() -> None:
+def test_the_error_of_a_withheld_stop_names_the_hard_wired_stop() -> None:
     line, drive, sim = one(InvtCHE(1))
     sim["device"] = 0x010A
     with pytest.raises(
@@ -487,7 +489,7 @@ def shows(line: SimulatedBus, drive: Drive, name: str, count: int) -> None:
 
 @table(("model", "name", "count"), UNEXPECTED_COUNTS)
 @table("how", ["stop", "stop_all", "write"])
-def test_an_unexpected_register_value_prevents_writes_but_no_stop(
+def test_an_unexpected_register_value_prevents_writes_but_not_stops(
     model: str, name: str, count: int, how: str
 ) -> None:
     line, drive, _ = one(MAKE[model](1))
@@ -510,7 +512,7 @@ def test_an_unexpected_register_value_prevents_writes_but_no_stop(
 
 
 @table("model", MAKE)
-def test_a_drive_that_refuses_the_identity_check_is_sent_its_stop(model: str) -> None:
+def test_a_stop_is_sent_to_a_drive_that_refuses_identity_reads(model: str) -> None:
     """Reads with function 04 are answered: only the ERMAN's identity check uses them."""
     line, drive, _ = one(MAKE[model](1))
 
@@ -521,7 +523,7 @@ def test_a_drive_that_refuses_the_identity_check_is_sent_its_stop(model: str) ->
     assert STOPS[model](writes(line)[0])
 
 
-def test_a_stop_does_not_wait_for_another_drives_second_check() -> None:
+def test_a_stop_does_not_wait_for_repeated_identity_checks_of_another_drive() -> None:
     """The stop of an identified drive does not wait for the first check of another drive either."""
     others = [YD1000(1), InvtCHE(2, maximum_frequency=50), InvtCHE(3, maximum_frequency=50)]
     line = SimulatedBus(*(simulated(drive) for drive in others))
@@ -542,7 +544,7 @@ def test_a_stop_does_not_wait_for_another_drives_second_check() -> None:
 
 
 @pytest.mark.parametrize("suspicions", [1, 2])
-def test_a_written_stop_is_refused_after_two_wrong_replies(suspicions: int) -> None:
+def test_a_stop_by_register_write_is_refused_after_two_wrong_identities(suspicions: int) -> None:
     line, drive, _ = one(InvtCHE(1))
     odd = build_reply(Framing.RTU, Message(1, 3, data=b"\x01\x0a"))  # a Goodrive300L
     line.answers = lambda request: odd if len(line.frames) <= suspicions else None
@@ -582,7 +584,7 @@ def answers_as(line: SimulatedBus, counts: dict[int, int]) -> None:
     line.answers = answer
 
 
-def test_registers_of_other_makes_are_not_read_after_the_first_write() -> None:
+def test_registers_of_other_families_are_read_only_before_the_first_write() -> None:
     """An INNOVERT IBD does not answer reads of registers that it lacks. Each such read delays polling."""
     line, drive, _ = one(InnovertIBD(1, confirmed=1))
     count_silences(line)
@@ -595,7 +597,7 @@ def test_registers_of_other_makes_are_not_read_after_the_first_write() -> None:
     assert GOODRIVE_DEVICE not in {request.start for request, _ in line.frames}
 
 
-def test_another_make_is_recognised_although_its_first_reply_is_lost() -> None:
+def test_a_wrong_family_is_recognised_although_the_first_reply_is_lost() -> None:
     line, drive, _ = one(InnovertIBD(1, confirmed=1))
     count_silences(line)
     answers_as(line, {GOODRIVE_DEVICE: GOODRIVE, 0x2100: 3, 0x0000: 0})
@@ -605,7 +607,7 @@ def test_another_make_is_recognised_although_its_first_reply_is_lost() -> None:
     assert line.written == []
 
 
-def test_other_makes_are_still_recognised_after_a_missing_reply() -> None:
+def test_a_wrong_family_is_recognised_after_an_unanswered_read() -> None:
     line, drive, _ = one(InnovertIBD(1, confirmed=1))
     count_silences(line)
     line.loses = lambda request: True
@@ -618,7 +620,7 @@ def test_other_makes_are_still_recognised_after_a_missing_reply() -> None:
     assert line.written == []
 
 
-def test_a_waiting_write_is_not_sent_on_a_reopened_port(
+def test_a_waiting_write_is_not_sent_after_the_port_is_reopened(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The drive may have been replaced, so its family must be checked again first."""

@@ -47,7 +47,7 @@ def interrupted(call: Callable[[], object], nth: int) -> KeyboardInterrupt | Non
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("verb", ["start", "coast", "stop"])
-def test_an_interruption_reports_what_may_have_been_sent(verb: str) -> None:
+def test_a_keyboard_interrupt_reports_what_may_have_been_sent(verb: str) -> None:
     sim = simulated(InvtCHE(1, baudrate=BAUDRATE, maximum_frequency=50))
     assert isinstance(sim, MotorDrive)
     received = ReceivedRequests(sim)
@@ -118,7 +118,7 @@ class Careful(Own):
 
 @pytest.mark.parametrize("model", MAKE)
 @pytest.mark.parametrize("all_of_them", [False, True])
-def test_a_stop_that_is_interrupted_is_sent_once_more(model: str, all_of_them: bool) -> None:
+def test_a_stop_is_sent_once_more_after_an_interruption(model: str, all_of_them: bool) -> None:
     line, drive, _ = one(MAKE[model](1))
     drive.set_frequency(20)
     drive.start()
@@ -156,7 +156,7 @@ def test_an_interrupted_stop_also_ends_a_jog() -> None:
     assert [request for request, _ in line.frames[-3:]] == sent
 
 
-def test_a_stop_script_that_only_reads_does_not_delay_other_stops() -> None:
+def test_a_stop_that_keeps_reading_does_not_delay_other_stops() -> None:
     sims: list[Any] = [simulated(Restless(1)), simulated(InvtCHE(2, maximum_frequency=50))]
     line = SimulatedBus(*sims)
     restless, other = (line.attach(sim.drive) for sim in sims)
@@ -173,7 +173,7 @@ def test_a_stop_script_that_only_reads_does_not_delay_other_stops() -> None:
     assert [request.address for request in writes(line, begun)][:4] == [1, 2, 2, 2]
 
 
-def test_an_interrupted_stop_is_sent_again_with_its_reads_but_without_its_waits() -> None:
+def test_an_interrupted_stop_is_sent_again_up_to_the_first_wait() -> None:
     line = SimulatedBus(simulated(Careful(1)))
     drive = line.attach(Careful(1))
     drive.write(drive.ratio, 3.0)
@@ -189,7 +189,7 @@ def test_an_interrupted_stop_is_sent_again_with_its_reads_but_without_its_waits(
     ]
 
 
-def test_a_second_interruption_ends_the_repetition_of_a_stop() -> None:
+def test_a_second_ctrl_c_ends_the_retries_of_a_stop() -> None:
     line, drive, _ = one(InvtCHE(1, maximum_frequency=50))
     line.bus.check_identity(drive)
 

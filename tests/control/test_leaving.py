@@ -48,13 +48,13 @@ def test_a_bus_shows_whether_stop_on_exit_was_called(pair: RunningPair) -> None:
     assert pair.bus.stops_on_exit is True
 
 
-def test_all_drives_are_stopped_immediately_on_leave(pair: RunningPair) -> None:
+def test_leave_stops_all_drives_immediately(pair: RunningPair) -> None:
     pair.bus.stop_on_exit()
     pair.bus.leave()
     until(lambda: pair.turning == [False, False])
 
 
-def test_no_stop_is_sent_by_default_when_the_bus_is_left(pair: RunningPair) -> None:
+def test_leave_sends_no_stop_by_default(pair: RunningPair) -> None:
     pair.bus.leave()
     pair.bus.part()
     assert pair.turning == [True, True]
@@ -88,7 +88,7 @@ def test_detached_drives_are_stopped_if_stop_on_exit_was_called(
     pair.line.fails = lambda request: None
 
 
-def test_a_drive_being_detached_cannot_be_started_after_its_stop(pair: RunningPair) -> None:
+def test_a_start_is_cancelled_while_the_drive_is_being_detached(pair: RunningPair) -> None:
     """The drive's start is called at the moment when the first request of its stop is sent."""
     pair.bus.stop_on_exit()
     first = pair.drives[0]
@@ -114,7 +114,7 @@ def test_detaching_drives_waits_for_their_stops(pair: RunningPair, monkeypatch: 
 
 
 @pytest.mark.parametrize("is_cut_short", [False, True])
-def test_closing_a_bus_waits_for_all_stops_unless_a_third_signal_comes(
+def test_closing_a_bus_waits_for_stops_unless_repeated_signals_end_the_wait(
     pair: RunningPair, monkeypatch: pytest.MonkeyPatch, is_cut_short: bool
 ) -> None:
     pair.bus.stop_on_exit()
@@ -134,7 +134,7 @@ def test_closing_a_bus_waits_for_all_stops_unless_a_third_signal_comes(
     assert waited == ([] if is_cut_short else [()])
 
 
-def test_the_argument_stop_on_exit_makes_a_bus_stop_its_drives() -> None:
+def test_stop_on_exit_can_be_passed_as_a_bus_argument() -> None:
     line = SimulatedBus(simulated(InvtCHE(1)), stop_on_exit=True)
     assert line.bus.stops_on_exit
     line.bus.close()
@@ -163,7 +163,9 @@ def test_attaching_a_drive_of_another_open_bus_raises() -> None:
     line.attach(drive)  # closing the other bus has detached the drive
 
 
-def test_a_drive_can_be_attached_to_another_bus_while_its_bus_closes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_drive_can_be_attached_to_a_new_bus_before_the_old_closes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Once the first bus is closed completely, the drive is still attached to the second bus."""
     line, drive, sim = one(InvtCHE(1, maximum_frequency=50))
     before = line.bus
@@ -202,7 +204,9 @@ def test_closing_a_bus_releases_its_drives() -> None:
     assert drive.bus is None
 
 
-def test_threads_that_attach_concurrently_add_one_drive_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_drives_attached_by_concurrent_threads_are_added_one_at_a_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     line = SimulatedBus()
     together = threading.Barrier(8)
     add, inside, most = line.bus._exchanges.peers.add, set[str](), 0
@@ -257,7 +261,7 @@ def test_a_thread_does_not_wait_for_its_own_interrupted_stop() -> None:
     assert latches.latch(drive).permit().is_good
 
 
-def test_the_motor_of_a_drive_attached_after_leave_cannot_be_started() -> None:
+def test_a_drive_attached_after_leave_cannot_be_started() -> None:
     """After `leave`, the process is ending, and could not stop the motor."""
     line, drive, sim = one(InvtCHE(1, maximum_frequency=50))
     line.bus.leave()
@@ -272,7 +276,7 @@ def test_the_motor_of_a_drive_attached_after_leave_cannot_be_started() -> None:
     assert not sim.motor.energised
 
 
-def test_a_detached_drive_is_freed_at_once() -> None:
+def test_the_memory_of_a_detached_drive_is_freed_immediately() -> None:
     """Memory does not grow if drives change for years, even without a garbage collection."""
     line, drive, _ = one(InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(20)

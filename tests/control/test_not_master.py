@@ -123,7 +123,7 @@ CALLS: dict[str, Callable[[Scene], object]] = {
 
 
 @pytest.mark.parametrize("call", CALLS.values(), ids=CALLS)
-def test_no_call_sends_before_the_process_is_master(scene: Scene, call: Callable[[Scene], object]) -> None:
+def test_calls_send_nothing_before_mastership_starts(scene: Scene, call: Callable[[Scene], object]) -> None:
     begun = time.monotonic()
     with pytest.raises(NotMaster) as failure:
         call(scene)
@@ -138,7 +138,7 @@ def test_no_call_sends_before_the_process_is_master(scene: Scene, call: Callable
 
 @pytest.mark.slow
 @pytest.mark.parametrize("call", usually("start", *(call for call in CALLS if call != "start")))
-def test_no_call_sends_once_the_process_is_no_longer_master(scene: Scene, call: str) -> None:
+def test_calls_send_nothing_after_mastership_ends(scene: Scene, call: str) -> None:
     scene.become_master()
     scene.drive.read(Toy.output_current)
     before = scene.requests
@@ -148,7 +148,7 @@ def test_no_call_sends_once_the_process_is_no_longer_master(scene: Scene, call: 
     assert scene.requests == before
 
 
-def test_a_request_without_the_right_to_send_is_no_drive_failure(scene: Scene) -> None:
+def test_requests_without_mastership_do_not_count_as_drive_failures(scene: Scene) -> None:
     for _ in range(3):
         with pytest.raises(NotMaster):
             scene.drive.read(Toy.output_current)
@@ -157,7 +157,7 @@ def test_a_request_without_the_right_to_send_is_no_drive_failure(scene: Scene) -
 
 
 @pytest.mark.long
-def test_nothing_is_sent_once_the_right_to_send_has_expired(scene: Scene) -> None:
+def test_nothing_is_sent_after_mastership_expires(scene: Scene) -> None:
     """The mastership ends by the clock alone, without a call of `end`."""
     mastership = Mastership(guard_s=8)
     path = scene.simulator.wires[0].path
@@ -197,7 +197,7 @@ def test_the_error_of_an_unsent_stop_says_that_the_motor_runs_on(
     ]
 
 
-def test_each_unsent_stop_is_reported_by_stop_all(scene: Scene) -> None:
+def test_stop_all_reports_failed_for_each_unsent_stop(scene: Scene) -> None:
     other = scene.bus.attach(Brief(2, name="fan"))
     found = scene.bus.stop_all()
     assert {name: stopped.seen for name, stopped in found.items()} == {
@@ -253,7 +253,9 @@ def test_a_partly_sent_write_is_unconfirmed(scene: Scene, monkeypatch: pytest.Mo
 
 
 @pytest.mark.slow
-def test_a_script_whose_second_write_is_unsent_raises(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_script_raises_if_the_second_write_is_not_sent(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The first write is done and recorded; the second write was not sent."""
     scene.become_master()
     hold_back(monkeypatch, scene, sent_ns=0, after=1)
@@ -267,7 +269,9 @@ def test_a_script_whose_second_write_is_unsent_raises(scene: Scene, monkeypatch:
     assert len([*read_audit(scene.audit)]) == 1
 
 
-def test_a_sent_stop_of_a_former_master_is_unconfirmed(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_counts_as_sent_if_mastership_ends_afterwards(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The stop was sent, so it is not reported as unsent."""
     scene.become_master()
     carry_out = scene.bus.line.carry_out
@@ -404,7 +408,7 @@ def test_a_stop_is_sent_although_another_master_is_heard(shared: tuple[int, Bus,
 
 @pytest.mark.slow
 @pytest.mark.parametrize("port", ["tcp://127.0.0.1:0", "socket://127.0.0.1:0"])
-def test_network_ports_send_nothing_unless_the_process_is_master(port: str) -> None:
+def test_network_ports_send_only_while_the_process_is_master(port: str) -> None:
     mastership, sim = Mastership(), simulated(Brief(1))
     mastership.extend(now_ns() + 1000 * S)
     simulator = Simulator([Wire([sim], unpaced=True, port=port)])
@@ -428,7 +432,7 @@ def test_only_the_master_opens_the_port(scene: Scene) -> None:
         Bus(path, mastership=scene.mastership)
 
 
-def test_a_stop_on_an_unopened_port_says_it_was_not_sent(scene: Scene) -> None:
+def test_a_stop_on_a_closed_port_reports_that_nothing_was_sent(scene: Scene) -> None:
     scene.bus.line.drop()
     with pytest.raises(NotMaster, match="the stop was NOT sent"):
         scene.drive.stop()
@@ -439,7 +443,7 @@ def test_a_stop_on_an_unopened_port_says_it_was_not_sent(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize("port", ["rfc2217://127.0.0.1:4001", "loop://", "spy:///dev/null"])
-def test_a_shared_line_cannot_use_a_port_that_pyserial_opens(port: str) -> None:
+def test_pyserial_ports_cannot_be_used_with_a_mastership(port: str) -> None:
     """A `Mastership` is the right to send on a line that several processes share."""
     with pytest.raises(NoSuchPort, match="a port of this kind cannot be used with a mastership"):
         Bus(port, mastership=Mastership())
@@ -452,7 +456,7 @@ def test_a_mastership_of_another_type_raises_type_error() -> None:
         Bus("/dev/null", mastership=0.7)  # type: ignore[arg-type]
 
 
-def test_a_bus_on_an_unshared_line_sends_without_permission(scene: Scene) -> None:
+def test_a_bus_without_a_mastership_argument_sends_normally(scene: Scene) -> None:
     path = scene.simulator.wires[0].path
     scene.bus.close()
     with Bus(path) as bus:

@@ -98,7 +98,7 @@ def test_a_verb_returns_a_command_result(model: str) -> None:
     assert isinstance(drive.state(), State)
 
 
-def test_a_start_ends_after_a_stop_even_if_its_script_continues() -> None:
+def test_a_cancelled_start_sends_no_write_although_the_script_continues() -> None:
     line, drive = stubborn()
     call_stop_at(line, drive, 1)
     with pytest.raises(
@@ -118,7 +118,7 @@ def test_the_error_of_a_cancelled_ramp_names_the_unsent_write() -> None:
     assert len(line.written) == before
 
 
-def test_a_fault_reset_clears_its_coil_after_a_stop(tmp_path: Path) -> None:
+def test_the_fault_reset_coil_is_cleared_after_a_stop_during_the_reset(tmp_path: Path) -> None:
     """Otherwise the reset coil would stay on, and reset the next fault by itself."""
     audit = tmp_path / "audit"
     line, drive, _ = one(ErmanERG220(1), audit=audit)
@@ -137,7 +137,7 @@ def test_a_fault_reset_clears_its_coil_after_a_stop(tmp_path: Path) -> None:
     line.bus.close()
 
 
-def test_a_stop_sent_as_a_plain_write_is_recorded(tmp_path: Path) -> None:
+def test_a_stop_sent_as_a_register_write_is_recorded(tmp_path: Path) -> None:
     line, drive, _ = one(InvtCHE(1), audit=tmp_path / "audit")
     drive.write(drive.control, CHEControl.STOP)
     line.bus._records.flush(60)
@@ -194,7 +194,7 @@ def turning(model: str) -> tuple[SimulatedBus, Any, MotorDrive]:
 
 
 @every_directed
-def test_a_reversal_returns_once_the_motor_is_seen_to_turn_in_reverse(model: str) -> None:
+def test_a_reversal_returns_when_the_motor_turns_in_reverse(model: str) -> None:
     line, drive, sim = turning(model)
     drive.start(Direction.REVERSE)
     assert drive.state().direction is Direction.REVERSE
@@ -207,7 +207,7 @@ def test_a_reversal_returns_once_the_motor_is_seen_to_turn_in_reverse(model: str
 
 @every_directed
 @pytest.mark.parametrize("options", usually({"stop_time": 5}, {}))
-def test_a_reversal_that_the_drive_ignores_is_unconfirmed(
+def test_a_reversal_is_unconfirmed_if_the_drive_ignores_the_command(
     monkeypatch: pytest.MonkeyPatch, model: str, options: dict[str, float]
 ) -> None:
     line, drive, sim = turning(model)
@@ -254,7 +254,7 @@ def test_refused_writes_are_logged(caplog: pytest.LogCaptureFixture) -> None:
     assert line.written == []
 
 
-def test_a_reset_whose_effect_cannot_be_read_is_unconfirmed() -> None:
+def test_a_fault_reset_is_unconfirmed_if_the_fault_record_is_unreadable() -> None:
     """The reply to the reset is lost, and so are the replies to reads of the fault record."""
     line, drive, sim = one(YD1000(1))
     sim.trip(4)
@@ -269,7 +269,7 @@ def test_a_reset_whose_effect_cannot_be_read_is_unconfirmed() -> None:
         drive.reset_fault()
 
 
-def test_an_error_shows_whether_the_write_budget_was_the_reason(tmp_path: Path) -> None:
+def test_is_budget_is_true_only_for_refusals_by_the_eeprom_budget(tmp_path: Path) -> None:
     line, drive, _ = one(DelixiModbus(1), ledger=tmp_path / "wear")
     drive.write(drive.frequency, 12.0)
     with pytest.raises(WriteForbidden, match="was written 0 s ago") as refusal:
@@ -336,7 +336,7 @@ def told(make: Make) -> tuple[SimulatedBus, Drive]:
 
 
 @every_unreadable
-def test_a_setpoint_that_the_library_refuses_does_not_change_the_known_setpoint(make: Make) -> None:
+def test_the_known_setpoint_is_unchanged_if_the_library_refuses_a_new_one(make: Make) -> None:
     bus, drive = told(make)
     known = drive.commanded
     with pytest.raises((WriteForbidden, ValueError)):
@@ -347,7 +347,7 @@ def test_a_setpoint_that_the_library_refuses_does_not_change_the_known_setpoint(
 
 
 @every_unreadable
-def test_an_unsent_setpoint_does_not_change_the_known_setpoint(make: Make) -> None:
+def test_the_known_setpoint_is_unchanged_if_a_new_one_is_not_sent(make: Make) -> None:
     """The write expired in the queue. For a write that a stop cancelled, the core reports the same result."""
     bus, drive = told(make)
     known = drive.commanded
@@ -358,7 +358,7 @@ def test_an_unsent_setpoint_does_not_change_the_known_setpoint(make: Make) -> No
     assert drive.commanded == known
 
 
-def test_a_setpoint_that_the_drive_refuses_does_not_change_the_known_setpoint() -> None:
+def test_the_known_setpoint_is_unchanged_if_the_drive_refuses_a_new_one() -> None:
     bus, drive = told(lambda: InnovertIBD(1, maximum_frequency=50))
     known = drive.commanded
     bus.refuses = lambda request: 4 if is_write(request) else 0
@@ -371,7 +371,7 @@ def test_a_setpoint_that_the_drive_refuses_does_not_change_the_known_setpoint() 
 
 @every_unreadable
 @pytest.mark.parametrize("arrives", [True, False])
-def test_a_start_is_refused_if_a_setpoint_had_no_reply(make: Make, arrives: bool) -> None:
+def test_a_start_is_refused_if_the_setpoint_write_had_no_reply(make: Make, arrives: bool) -> None:
     bus, drive = told(make)
     if arrives:
         bus.loses = is_write
@@ -387,7 +387,9 @@ def test_a_start_is_refused_if_a_setpoint_had_no_reply(make: Make, arrives: bool
     assert bus.written == []
 
 
-def test_the_setpoint_is_forgotten_if_the_drive_keeps_another_value(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_known_setpoint_is_cleared_if_the_drive_keeps_another_value(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     _, drive, sim = one(ErmanERG220(1))
     drive.set_frequency(20)
     take = type(sim).answer

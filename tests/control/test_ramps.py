@@ -54,7 +54,7 @@ def test_a_ramp_waits_between_its_steps_but_not_after_the_last() -> None:
     assert line.seconds - written_at[-1] < 0.5
 
 
-def test_a_long_ramp_does_not_expire_by_its_small_delays(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_ramp_does_not_expire_if_each_step_is_slightly_late(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(YD1000(1))
     drive.set_frequency(1)
     monkeypatch.setattr(clock, "sleep", lambda seconds: line.sleep(seconds + 0.01))
@@ -62,7 +62,7 @@ def test_a_long_ramp_does_not_expire_by_its_small_delays(monkeypatch: pytest.Mon
     assert steps(line)[-1] == 6000
 
 
-def test_a_ramp_ends_after_a_suspension_of_the_process(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_ramp_expires_after_the_computer_slept(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drive, _ = one(YD1000(1))
     drive.set_frequency(1)
 
@@ -85,7 +85,7 @@ def test_a_ramp_ends_after_a_suspension_of_the_process(monkeypatch: pytest.Monke
         (InvtCHE(1, maximum_frequency=80), 20, 16.0, 2.0, [2250, 2000]),  # 18 Hz and 16 Hz as shares of 80 Hz
     ],
 )
-def test_the_steps_of_a_ramp_are_written_in_the_drive_s_unit(
+def test_ramp_steps_are_written_in_the_unit_of_the_drive(
     drive: Any, before: float, to: float, rate: float, counts: list[int]
 ) -> None:
     line, drive, _ = one(drive)
@@ -116,7 +116,7 @@ def ramped(family: type[Drive], **options: float) -> tuple[Any, Any, Any]:
     return line, line.attach(family(1, **options)), sim
 
 
-def test_a_ramp_starts_from_the_setpoint_that_it_reads() -> None:
+def test_a_ramp_starts_from_the_setpoint_read_from_the_drive() -> None:
     """The ramp also works if `set_frequency` sends no write, because the drive has the setpoint already."""
     line, drive, _ = ramped(Ramped)
     ramp(drive, 2.0, rate=1.0, every=1.0)
@@ -134,7 +134,7 @@ def test_a_ramp_starts_from_the_setpoint_that_it_reads() -> None:
 
 
 @pytest.mark.parametrize(("most", "seconds"), [(50, 0), (0, 10)])
-def test_a_ramp_needs_a_rate_if_the_drives_own_is_unusable(most: int, seconds: int) -> None:
+def test_a_ramp_needs_a_rate_if_the_drives_acceleration_is_unusable(most: int, seconds: int) -> None:
     line, drive, sim = ramped(Ramped)
     sim["maximum_frequency"], sim["acceleration_time"] = most, seconds
     with pytest.raises(
@@ -173,7 +173,7 @@ def test_staggered_starts_keep_the_given_gap(gap: float) -> None:
 
 
 @pytest.mark.parametrize("gap", [4.0, 25.0])
-def test_a_drive_that_waits_for_its_start_is_read_regularly(gap: float) -> None:
+def test_waiting_drives_are_read_regularly_during_a_staggered_start(gap: float) -> None:
     """Otherwise a start would be refused: after a silence, a setpoint that cannot be read counts as lost."""
     sims: list[Any] = [simulated(InnovertIBD(address, maximum_frequency=50)) for address in range(1, 6)]
     line = SimulatedBus(*sims)
@@ -200,7 +200,7 @@ def test_no_staggered_start_is_sent_after_the_computer_slept(monkeypatch: pytest
     assert not any(sim.motor.energised for sim in sims)
 
 
-def test_a_staggered_start_does_not_stop_drives_it_never_reached() -> None:
+def test_a_failed_staggered_start_does_not_stop_drives_not_yet_started() -> None:
     line, drives, sims = che_drives(3)
     sims[1].trip(4)
     line.frames.clear()
@@ -209,7 +209,7 @@ def test_a_staggered_start_does_not_stop_drives_it_never_reached() -> None:
     assert {request.address for request, _ in line.frames if is_write(request)} == {1, 2}
 
 
-def test_a_failed_staggered_start_sends_no_stop_to_a_drive_of_unknown_identity() -> None:
+def test_a_failed_staggered_start_sends_no_stop_to_an_unidentified_drive() -> None:
     """An INNOVERT IBD's stop writes 0001H to the address 2000H, which runs an INVT Goodrive."""
     sims: list[Any] = [simulated(InnovertIBD(1)), simulated(PROFILES["invt-goodrive"](2))]
     line = SimulatedBus(*sims)
@@ -295,7 +295,7 @@ class NoThread(threading.Thread):
         raise RuntimeError("can't start new thread")
 
 
-def test_each_started_drive_is_sent_a_stop_before_one_is_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_started_drives_get_a_stop_before_any_stop_is_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
     """A staggered start has failed, and the system has no thread for the stops."""
     _, drives, sims = che_drives(2)
     sims[1].trip(4)
@@ -306,7 +306,7 @@ def test_each_started_drive_is_sent_a_stop_before_one_is_repeated(monkeypatch: p
     assert noted.calls == [(1, 0.0), (2, 0.0), (1, None), (2, None)]
 
 
-def test_an_interrupted_stop_is_sent_again_without_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_stop_is_sent_again_if_no_thread_can_start(monkeypatch: pytest.MonkeyPatch) -> None:
     _, drives, sims = che_drives(2)
     sims[1].trip(4)
     noted = NotedCalls(drives)
@@ -322,7 +322,7 @@ def test_an_interrupted_stop_is_sent_again_without_threads(monkeypatch: pytest.M
     assert noted.calls == [(1, 0.0), (2, 0.0), (1, None), (1, 0.0), (2, 0.0)]
 
 
-def test_a_failed_staggered_start_stops_the_drives_it_started() -> None:
+def test_a_failed_staggered_start_stops_the_started_drives() -> None:
     line, drives, sims = che_drives(3)
     begun = line.seconds
     start_staggered(drives, 2.0, Direction.FORWARD)
@@ -358,7 +358,7 @@ def test_wrong_arguments_of_a_ramp_raise_type_error_before_any_frame() -> None:
     assert line.frames == []
 
 
-def test_a_ramp_is_never_faster_than_the_drive_s_own_ramp() -> None:
+def test_a_ramp_is_never_faster_than_the_ramp_of_the_drive() -> None:
     line, drive, _ = one(YD1000(1))
     drive.set_frequency(10)
     line.frames.clear()
@@ -374,7 +374,7 @@ def test_a_ramp_is_never_faster_than_the_drive_s_own_ramp() -> None:
     assert line.written[-2][:17] == "01 06 10 01 07 9E"
 
 
-def test_a_ramp_without_a_known_acceleration_needs_a_rate() -> None:
+def test_a_ramp_needs_a_rate_if_the_family_declares_no_acceleration() -> None:
     line, drive, _ = one(InvtCHE(1, maximum_frequency=50))
     with pytest.raises(WriteForbidden, match="pass rate"):
         ramp(drive, 20.0)
@@ -395,7 +395,7 @@ def test_a_ramp_to_a_forbidden_setpoint_sends_no_step(model: str) -> None:
     assert len(line.written) == 1
 
 
-def test_a_ramp_starts_from_a_setpoint_of_a_plain_write() -> None:
+def test_a_ramp_starts_from_the_setpoint_of_the_last_register_write() -> None:
     """The setpoint cannot be read. A ramp from the older setpoint would start with a jump."""
     line, drive, _ = one(InnovertIBD(1, confirmed=1))
     drive.set_frequency(40)
@@ -445,7 +445,7 @@ class AliasToy(Toy):
         yield from self._write_setpoint(self.frequency, hz)
 
 
-def test_a_ramp_through_a_ram_alias_writes_no_eeprom(tmp_path: Path) -> None:
+def test_a_ramp_writes_no_eeprom_if_the_setpoint_has_a_ram_address(tmp_path: Path) -> None:
     line = SimulatedBus(simulated(AliasToy(1)), ledger=tmp_path / "wear.sqlite")
     toy = line.attach(AliasToy(1))
     ramp(toy, 10, rate=8.0)

@@ -83,7 +83,7 @@ def test_all_paths_of_a_port_share_one_eeprom_budget(tmp_path: Path, monkeypatch
         assert (wear.cell.port, wear.writes) == (device, 1)
 
 
-def test_all_names_of_a_host_share_one_eeprom_write_a_minute(tmp_path: Path) -> None:
+def test_all_names_of_a_host_share_one_eeprom_write_limit(tmp_path: Path) -> None:
     ledger = Ledger(tmp_path / "wear")
     with toys("socket://127.0.0.1:0") as sim:
         path = sim.wires[0].path
@@ -145,7 +145,7 @@ def test_a_port_without_a_device_is_identified_by_its_name() -> None:
         ("socket://10.0.0.7:4001", "rfc2217://10.0.0.7:4001"),
     ],
 )
-def test_ledger_entries_with_an_older_name_of_the_port_are_counted(old: str, spelt: str) -> None:
+def test_ledger_entries_under_an_older_port_name_are_counted(old: str, spelt: str) -> None:
     with TemporaryDirectory() as folder:
         Path(folder, "device").touch()
         Path(folder, "link").symlink_to("device")
@@ -161,7 +161,7 @@ def test_ledger_entries_with_an_older_name_of_the_port_are_counted(old: str, spe
             assert [(each.cell.port, each.writes) for each in ledger.wear(1003.0)] == [(now, 3)]
 
 
-def test_a_write_to_a_register_in_ram_is_not_in_the_ledger(tmp_path: Path) -> None:
+def test_writes_to_ram_registers_are_not_counted_in_the_eeprom_ledger(tmp_path: Path) -> None:
     class Fan(Drive):
         """A user's own drive."""
 
@@ -185,7 +185,9 @@ def test_a_write_to_a_register_in_ram_is_not_in_the_ledger(tmp_path: Path) -> No
 with_names = pytest.mark.skipif(sys.platform != "linux", reason="this system has no names for it")
 
 
-def test_a_user_without_a_home_can_stop_drives_but_not_write_eeprom(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_eeprom_writes_are_refused_for_a_user_without_a_home_directory(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """A container's user often has neither HOME nor an entry in /etc/passwd."""
 
     def home() -> Path:
@@ -207,7 +209,7 @@ def test_a_user_without_a_home_can_stop_drives_but_not_write_eeprom(monkeypatch:
 
 @with_names
 @pytest.mark.parametrize("port", ["pty", "link", "socket://127.0.0.1:0", "socket://0.0.0.0:0"])
-def test_a_write_to_a_simulated_drive_is_not_in_the_users_ledger(tmp_path: Path, port: str) -> None:
+def test_writes_to_simulated_drives_are_not_counted_in_the_users_ledger(tmp_path: Path, port: str) -> None:
     with toys(str(tmp_path / "link") if port == "link" else port) as sim:
         path = sim.wires[0].path.replace("0.0.0.0", "127.0.0.1")
         write(path, 12.0)
@@ -257,7 +259,7 @@ def test_a_real_port_does_not_count_as_simulated() -> None:
     os.close(master)
 
 
-def test_a_simulated_write_is_counted_if_its_port_is_not_recognised(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_simulated_write_is_counted_if_the_port_seems_real(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(port_identity, "_HAS_NAMES", False)
     with toys() as sim:
         write(sim.wires[0].path, 12.0)
@@ -343,7 +345,7 @@ ENDINGS: dict[str, tuple[BaseException, int, Callable[[SimulatedBus, Any], objec
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
-def test_a_write_that_is_interrupted_or_fails_is_recorded(
+def test_interrupted_and_failed_writes_are_recorded(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, ending: str
 ) -> None:
     failure, function, act, what = ENDINGS[ending]
@@ -379,7 +381,7 @@ WRITES: dict[str, tuple[str, Callable[[SimulatedBus, Any], object]]] = {
 
 
 @pytest.mark.parametrize(("kind", "delay"), [*product(WRITES, ["expired", "cancelled"]), ("start", "silent")])
-def test_an_unsent_write_that_was_recorded_has_a_second_record(
+def test_a_recorded_write_gets_a_second_record_if_not_sent(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, kind: str, delay: str
 ) -> None:
     """Without the second record, the write would look as if it had been in flight when the process died."""
@@ -404,7 +406,7 @@ def test_an_unsent_write_that_was_recorded_has_a_second_record(
     assert "sent" not in second
 
 
-def test_a_write_that_the_eeprom_ledger_refuses_is_recorded_as_not_sent(tmp_path: Path) -> None:
+def test_a_write_refused_by_the_eeprom_ledger_is_recorded_as_not_sent(tmp_path: Path) -> None:
     log = tmp_path / "audit.jsonl"
     line, drive, _ = one(YD1000(1), audit=log, ledger=tmp_path / "ledger")
     drive.write(drive.acceleration_time, 5.0)
@@ -468,7 +470,7 @@ def test_an_unconfirmed_write_is_recorded_with_its_author(audited: Audited) -> N
     assert audited.noted() == [("setpoint = 40.00 %", "anna", None)]
 
 
-def test_a_stop_after_a_failed_staggered_start_is_recorded_with_its_caller(audited: Audited) -> None:
+def test_stops_after_a_failed_staggered_start_are_recorded_with_the_author(audited: Audited) -> None:
     """The stops run on new threads, but their records name the author that was set in the caller's thread."""
     drive = audited.drive
     drive.set_frequency(20)
@@ -479,7 +481,7 @@ def test_a_stop_after_a_failed_staggered_start_is_recorded_with_its_caller(audit
     assert ("stop", "anna", None) in audited.noted()
 
 
-async def test_an_author_set_in_one_task_or_thread_does_not_apply_in_others(audited: Audited) -> None:
+async def test_a_write_author_applies_only_to_the_current_task_or_thread(audited: Audited) -> None:
     drive, turn = audited.drive, asyncio.Lock()  # the simulated bus serves only one caller at a time
 
     async def write(name: str, hz: float, mine: asyncio.Event, other: asyncio.Event) -> None:
@@ -502,7 +504,7 @@ async def test_an_author_set_in_one_task_or_thread_does_not_apply_in_others(audi
     assert audited.noted()[2:] == [("setpoint = 20.00 %", None, None)]
 
 
-def test_the_author_of_a_write_comes_from_the_innermost_block(audited: Audited) -> None:
+def test_the_innermost_written_by_block_sets_the_author_of_a_write(audited: Audited) -> None:
     with written_by("anna", "web"):
         with written_by("boris"), suppress(ZeroDivisionError):
             audited.drive.set_frequency(20)
@@ -534,7 +536,7 @@ NAMES: list[tuple[Any, str | None]] = [
 
 @pytest.mark.parametrize(("who", "noted"), NAMES, ids=range(len(NAMES)))
 @pytest.mark.parametrize("is_way", [False, True])
-def test_an_invalid_author_prevents_writes_but_no_stop(
+def test_an_invalid_author_prevents_writes_but_not_stops(
     audited: Audited, who: Any, noted: str | None, is_way: bool
 ) -> None:
     bus, drive = audited.bus, audited.drive
@@ -565,7 +567,7 @@ def test_an_invalid_author_prevents_writes_but_no_stop(
     assert sorted(stops) == [("control = STOP", *by)] * 2 + [("stop", *by)] * 4
 
 
-def test_a_log_of_an_older_version_is_read_and_extended(audited: Audited) -> None:
+def test_an_audit_log_of_an_older_version_can_be_extended(audited: Audited) -> None:
     audited.path.write_text('{"time": "2026-01-01T00:00:00.000000000Z", "write": "old", "outcome": "done"}\n')
     with written_by("anna"):
         audited.drive.set_frequency(20)

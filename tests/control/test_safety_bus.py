@@ -39,7 +39,7 @@ every_family = pytest.mark.parametrize("model", MAKE)
 
 
 @every_family
-def test_a_plain_write_never_starts_a_motor_nor_resets_a_fault(model: str) -> None:
+def test_a_register_write_cannot_start_a_motor_or_reset_a_fault(model: str) -> None:
     line, drive, sim = one(MAKE[model](1))
     controls = [each for each in drive.registers.values() if each.harmless is not None]
     assert controls
@@ -61,7 +61,7 @@ def test_a_plain_write_never_starts_a_motor_nor_resets_a_fault(model: str) -> No
     assert not sim.motor.energised
 
 
-def test_a_plain_write_may_stop_the_motor() -> None:
+def test_a_register_write_may_stop_the_motor() -> None:
     _, drive, _ = one(InvtCHE(1))
     assert drive.write(drive.control, CHEControl.STOP) is CHEControl.STOP
 
@@ -90,7 +90,7 @@ def test_a_plain_write_may_stop_the_motor() -> None:
         (ErmanERG220(1), "minimum_frequency", 50.1, r"above maximum_frequency"),
     ],
 )
-def test_a_write_that_is_forbidden_is_not_sent(drive: Drive, name: str, value: float, sentence: str) -> None:
+def test_a_forbidden_write_is_not_sent(drive: Drive, name: str, value: float, sentence: str) -> None:
     line, _, _ = one(drive)
     register = drive.register(name)
     with pytest.raises(WriteForbidden, match=sentence) as refusal:
@@ -114,7 +114,7 @@ def test_a_write_allowed_only_at_rest_is_refused_while_the_motor_turns() -> None
     assert sim["maximum_frequency"] == 90
 
 
-def test_a_raw_request_bypasses_all_rules_and_errors_name_it_as_raw() -> None:
+def test_a_raw_request_bypasses_the_write_rules() -> None:
     line, drive, _ = one(YD1000(1))
     assert drive.send_raw(6, 0x0000, b"\x00\x01") == b"\x00\x01"
     assert line.written == ["01 06 00 00 00 01 48 0A"]
@@ -125,7 +125,7 @@ def test_a_raw_request_bypasses_all_rules_and_errors_name_it_as_raw() -> None:
 
 
 @every_family
-def test_only_the_first_write_follows_an_identity_check(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
+def test_identity_is_checked_only_before_the_first_write(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
     monkeypatch.setattr(records, "LEAST_INTERVAL", 0.0)  # seconds between writes of one register to an EEPROM
     line, drive, _ = one(MAKE[model](1))
     drive.set_frequency(20)
@@ -142,7 +142,7 @@ def test_only_the_first_write_follows_an_identity_check(monkeypatch: pytest.Monk
     assert looks == ["look"]
 
 
-def test_an_unidentified_innovert_ibd_is_written_only_if_confirmed() -> None:
+def test_writes_to_an_unidentified_innovert_ibd_need_the_option_confirmed() -> None:
     for confirmed in (0, 1):
         line, drive, sim = one(InnovertIBD(1, confirmed=confirmed))
         sim["address_setting"] = 0
@@ -157,7 +157,7 @@ def test_an_unidentified_innovert_ibd_is_written_only_if_confirmed() -> None:
             assert line.written == []
 
 
-def test_the_outcome_of_each_write_is_returned_by_try_write() -> None:
+def test_try_write_returns_the_outcome_of_each_write() -> None:
     line, drive, _ = one(InnovertIBD(1))
     outcome = drive.try_write(drive.acceleration_time, 20.0)
     assert (outcome.effect, outcome.held) == (Effect.DONE, 20.0)
@@ -181,7 +181,9 @@ def test_the_outcome_of_each_write_is_returned_by_try_write() -> None:
 
 
 @every_family
-def test_only_stops_are_sent_while_a_late_reply_is_due(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
+def test_only_stops_are_sent_without_waiting_for_late_replies(
+    monkeypatch: pytest.MonkeyPatch, model: str
+) -> None:
     line, drive, _ = one(MAKE[model](1))
     insisted: list[bool] = []
     carry_out = line.carry_out
@@ -201,7 +203,7 @@ def test_only_stops_are_sent_while_a_late_reply_is_due(monkeypatch: pytest.Monke
     assert all(insisted)
 
 
-def test_a_modbus_exception_is_reported_with_its_meaning_for_the_family() -> None:
+def test_the_error_explains_the_exception_code_of_the_family() -> None:
     line, drive, _ = one(InvtCHE(1))
     line.bus.check_identity(drive)
     line.refuses = lambda request: 0x12 if request.function == 6 else 0
@@ -212,7 +214,7 @@ def test_a_modbus_exception_is_reported_with_its_meaning_for_the_family() -> Non
     assert len(line.written) == 1
 
 
-def test_a_watchdog_that_cannot_be_read_is_described_by_the_family() -> None:
+def test_the_watchdog_text_of_the_family_is_used_if_a_read_fails() -> None:
     line, drive, _ = one(YD1000(1))
     line.refuses = lambda request: 2 if request.function == 3 else 0
     assert line.bus.watchdog(drive) == drive.watchdog
@@ -247,7 +249,9 @@ class Tidy(Drive):
 
 
 @pytest.mark.parametrize("result", [Failure.EXPIRED, Failure.NOT_MASTER])
-def test_an_unsent_write_is_not_called_unconfirmed(monkeypatch: pytest.MonkeyPatch, result: Failure) -> None:
+def test_an_unsent_write_is_not_reported_as_unconfirmed(
+    monkeypatch: pytest.MonkeyPatch, result: Failure
+) -> None:
     """The write is not reported as unconfirmed even if a later read of the script fails."""
     line = SimulatedBus(simulated(Tidy(1)))
     drive = line.attach(Tidy(1, confirmed=1))
@@ -360,7 +364,7 @@ def test_an_error_is_raised_if_the_drive_limits_a_setpoint(monkeypatch: pytest.M
 
 
 @pytest.mark.slow
-def test_a_setpoint_loop_to_eeprom_is_refused_with_advice() -> None:
+def test_frequent_setpoint_writes_to_eeprom_are_refused_with_advice() -> None:
     line, drive, sim = one(DelixiModbus(1))
     drive.set_frequency(10.0)
     for step in range(60):  # once a second for a minute
@@ -390,7 +394,7 @@ def test_a_write_beyond_the_yearly_budget_is_refused(tmp_path: Path) -> None:
     drive.set_frequency(45)
 
 
-def test_a_register_declared_as_ram_is_not_counted(tmp_path: Path) -> None:
+def test_writes_to_a_register_declared_as_ram_are_not_counted(tmp_path: Path) -> None:
     ledger = Ledger(tmp_path / "wear", budget=1)
     line, drive, _ = one(ErmanERG220(1, ram=["frequency"]), ledger=ledger)
     for step in range(20):
@@ -402,7 +406,7 @@ def test_a_register_declared_as_ram_is_not_counted(tmp_path: Path) -> None:
         ErmanERG220(1, ram=["frequenzy"])
 
 
-def test_a_write_through_a_ram_alias_is_not_counted_as_an_eeprom_write(tmp_path: Path) -> None:
+def test_writes_to_a_ram_address_are_not_counted_as_eeprom_writes(tmp_path: Path) -> None:
     class Mine(InvtCHE):
         """An INVT CHE with a parameter declared by its owner."""
 
@@ -416,7 +420,7 @@ def test_a_write_through_a_ram_alias_is_not_counted_as_an_eeprom_write(tmp_path:
     assert ledger.wear(0) == []
 
 
-def test_the_drives_watchdog_setting_is_read_if_it_is_readable() -> None:
+def test_the_watchdog_setting_is_read_from_the_drive_if_readable() -> None:
     line, drive, sim = one(YD1000(1))
     assert not line.frames  # attaching sends no request
     assert line.bus.watchdog(drive) == (
@@ -429,7 +433,7 @@ def test_the_drives_watchdog_setting_is_read_if_it_is_readable() -> None:
     assert line.written == []
 
 
-def test_harmless_raw_counts_only_stop_the_motor_or_withdraw_a_command() -> None:
+def test_values_declared_harmless_only_stop_a_motor_or_clear_a_command() -> None:
     """A harmless raw count may be written repeatedly, so it may only stop a motor or withdraw a command."""
     for family in MODELS.values():
         for register in family.registers.values():
@@ -489,7 +493,7 @@ def test_an_identity_check_that_writes_is_refused() -> None:
     assert line.frames == []
 
 
-def test_a_write_allowed_only_at_rest_is_refused_without_a_readable_state() -> None:
+def test_a_write_allowed_only_at_rest_is_refused_if_the_state_is_unreadable() -> None:
     class Mute(Drive):
         """A family without the verb `state`."""
 
@@ -506,7 +510,7 @@ def test_a_write_allowed_only_at_rest_is_refused_without_a_readable_state() -> N
     assert line.written == []
 
 
-def test_the_bus_needs_no_ledger_before_the_first_write(tmp_path: Path) -> None:
+def test_the_eeprom_ledger_is_not_created_before_the_first_write(tmp_path: Path) -> None:
     line, drive, _ = one(ErmanERG220(1), ledger=tmp_path / "none" / "wear")
     assert drive.read(drive.frequency) == 0
     assert not (tmp_path / "none").exists()

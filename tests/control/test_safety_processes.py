@@ -127,7 +127,7 @@ def test_two_processes_share_one_eeprom_write_budget(tmp_path: Path) -> None:
     assert (wear.cell, wear.writes) == (CELL, 30)
 
 
-def test_a_ledger_keeps_its_entries_in_the_file(tmp_path: Path) -> None:
+def test_eeprom_ledger_entries_persist_in_the_file(tmp_path: Path) -> None:
     path = tmp_path / "deep" / "wear.sqlite"
     assert Ledger(path).wear(0) == []
     assert Ledger(path).enter(CELL, 1000.0, 60.0) == ""
@@ -164,7 +164,7 @@ for number in range(200):
 
 
 @pytest.mark.slow
-def test_processes_that_share_an_audit_log_do_not_mix_their_lines(tmp_path: Path) -> None:
+def test_audit_log_lines_of_two_processes_do_not_mix(tmp_path: Path) -> None:
     path = tmp_path / "audit.jsonl"
     writers = [subprocess.Popen([sys.executable, "-c", WRITER, str(path), name]) for name in "ab"]
     assert [writer.wait() for writer in writers] == [0, 0]
@@ -174,7 +174,7 @@ def test_processes_that_share_an_audit_log_do_not_mix_their_lines(tmp_path: Path
 
 
 @table("torn_at", range(0, 120, 7))
-def test_a_truncated_line_of_the_audit_log_damages_no_other_line(tmp_path: Path, torn_at: int) -> None:
+def test_other_audit_records_survive_a_truncated_line(tmp_path: Path, torn_at: int) -> None:
     path = tmp_path / "audit.jsonl"
     log = AuditLog(path)
     log.add(0, {"write": "first"})
@@ -218,7 +218,7 @@ def echoing(hears: Any = None) -> Iterator[str]:
 
 
 @pytest.mark.long
-def test_an_echo_without_a_drive_confirms_nothing() -> None:
+def test_an_echo_on_a_line_without_drives_confirms_no_command() -> None:
     with echoing() as port, Bus(port) as bus:
         pump = bus.attach(InvtCHE(1, maximum_frequency=50))
         with pytest.raises(NoReply):
@@ -261,7 +261,7 @@ def dies_and_echoes(line: SimulatedBus, drive: Drive) -> None:
 
 
 @table("declared", DRIVES)
-def test_an_echo_does_not_confirm_a_stop_sent_as_a_plain_write(declared: Drive) -> None:
+def test_an_echo_does_not_confirm_a_stop_sent_as_a_register_write(declared: Drive) -> None:
     line, drive, _ = one(type(declared)(1, **declared.option))
     stop = next(register for register in drive.registers.values() if register.harmless)
     value = stop.decode(stop.harmless[-1])

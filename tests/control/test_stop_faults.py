@@ -90,7 +90,7 @@ def check_failing(nth: int, failure: type[BaseException], all_of_them: bool) -> 
 @pytest.mark.parametrize("failure", [KeyboardInterrupt, MemoryError])
 @pytest.mark.parametrize("all_of_them", usually(False, True))
 @pytest.mark.parametrize("step", [*usually(1999, 331), pytest.param(67, marks=pytest.mark.nightly)])
-def test_a_stop_is_sent_although_it_fails_at_any_bytecode(
+def test_a_motor_is_stopped_although_an_exception_interrupts_any_bytecode(
     failure: type[BaseException], all_of_them: bool, step: int
 ) -> None:
     first = FIRST_OPCODES + 1
@@ -118,7 +118,7 @@ def test_a_stop_called_by_a_signal_handler_cancels_the_interrupted_start(verb: s
 
 
 @pytest.mark.parametrize("failure", [SystemExit, KeyboardInterrupt, GeneratorExit])
-def test_a_script_that_raises_system_exit_leaves_no_other_motor_running(failure: type[BaseException]) -> None:
+def test_other_motors_are_stopped_if_a_stop_script_raises_system_exit(failure: type[BaseException]) -> None:
     """SystemExit is raised only after all stops are over, even if the other motor's first stops are lost."""
 
     class Ending(Fan):
@@ -236,7 +236,7 @@ class NoRoom:
 
 @table("fault", [NO_MEMORY, NO_DESCRIPTORS], ids=["memory", "descriptors"])
 @table("all_of_them", [False, True])
-def test_a_stop_is_created_as_soon_as_the_system_has_memory_and_descriptors(
+def test_a_stop_is_sent_as_soon_as_memory_and_descriptors_are_available(
     monkeypatch: pytest.MonkeyPatch, fault: Exception, all_of_them: bool
 ) -> None:
     line, drives, sims = che_drives(runs_s=10)
@@ -248,7 +248,7 @@ def test_a_stop_is_created_as_soon_as_the_system_has_memory_and_descriptors(
     assert not sims[0].motor.energised
 
 
-def test_a_stop_that_cannot_be_made_raises_memory_error_after_30_s(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_raises_memory_error_after_30_s_without_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     line, drives, _ = che_drives(runs_s=10)
     begun, before = line.seconds, len(line.written)
     NoRoom(monkeypatch, 1000, NO_MEMORY)
@@ -258,7 +258,7 @@ def test_a_stop_that_cannot_be_made_raises_memory_error_after_30_s(monkeypatch: 
     assert len(line.written) == before
 
 
-def test_the_result_of_a_stop_says_that_no_descriptor_was_left(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_stop_result_says_that_no_file_descriptor_was_left(monkeypatch: pytest.MonkeyPatch) -> None:
     line, _, _ = che_drives(runs_s=10)
 
     def failing(exchange: Exchange, **details: Any) -> Completion:
@@ -316,7 +316,7 @@ def test_a_repeated_stop_opens_a_locked_eeprom_ledger_only_once(
     assert sum(wear.writes for wear in ledger.wear(1.8e9)) == len(line.written) - before > 40
 
 
-def test_a_stop_is_sent_even_if_the_port_name_is_not_text(
+def test_a_stop_is_sent_even_if_the_port_name_is_invalid_unicode(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     line = SimulatedBus(simulated(Fan(1)), ledger=tmp_path / "wear")

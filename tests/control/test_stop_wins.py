@@ -355,7 +355,7 @@ class Stops(RuleBasedStateMachine):
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", usually(*KINDS))
-def test_a_call_before_a_stop_moves_no_motor_after_it(kind: str) -> None:
+def test_no_earlier_call_moves_a_motor_after_a_stop(kind: str) -> None:
     machine = type(f"StopsOf{kind}", (Stops,), {"kind": kind})
     run_state_machine_as_test(
         machine,
@@ -371,7 +371,7 @@ def test_a_call_before_a_stop_moves_no_motor_after_it(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", usually(*KINDS))
-def test_a_stop_during_the_first_exchanges_of_a_start_cancels_it(kind: str) -> None:
+def test_a_start_is_cancelled_by_a_stop_during_the_first_exchanges(kind: str) -> None:
     """The stop is called after 0 to 5 exchanges of the start; the test calls the machine's rules itself."""
     machine = type(f"StopsOf{kind}", (Stops,), {"kind": kind})()
     machine.begin(polling=False, on_exit=False)

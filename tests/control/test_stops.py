@@ -65,7 +65,9 @@ EACH_AND_EACH = [
 
 
 @pytest.mark.parametrize(("model", "act"), EACH_AND_EACH)
-def test_a_stop_called_at_any_frame_of_a_start_wins(tmp_path: Path, model: str, act: str) -> None:
+def test_the_motor_is_stopped_if_a_stop_is_called_during_a_start(
+    tmp_path: Path, model: str, act: str
+) -> None:
     """A start that was sent is followed by the stop, and is never reported as unsent."""
     for frames in range(1, 100):
         line, drive, meanwhile, begun, failure = started_while(tmp_path, model, frames, ACTS[act])
@@ -168,7 +170,7 @@ def test_no_call_moves_a_motor_after_the_bus_is_closed() -> None:
 
 @every_family
 @pytest.mark.parametrize("seconds", [None, 12.0])
-def test_a_silent_drives_stop_leaves_half_of_the_line_to_others(model: str, seconds: float | None) -> None:
+def test_repeating_a_stop_uses_at_most_half_of_the_line_time(model: str, seconds: float | None) -> None:
     """Only the first frames of the stop are sent without delay. The total time of the stop stays the same."""
     line, drive, _ = one(MAKE[model](1))
     line.bus.check_identity(drive)
@@ -191,7 +193,7 @@ def test_a_silent_drives_stop_leaves_half_of_the_line_to_others(model: str, seco
 
 
 @pytest.mark.slow
-def test_a_stop_ends_after_its_time_limit_and_the_error_states_its_progress() -> None:
+def test_a_stop_raises_unconfirmed_after_the_time_limit() -> None:
     line, (drive,), _ = che_drives(hz=50, runs_s=20)
     begun = line.seconds
     with pytest.raises(Unconfirmed, match=r"the motor was not seen to stop within 2 s"):
@@ -263,7 +265,7 @@ class Patient(Own):
         yield from read(self.speed)
 
 
-def test_a_stop_scripts_waits_end_at_its_time_limit() -> None:
+def test_waits_in_a_stop_script_end_at_the_time_limit() -> None:
     line = SimulatedBus(simulated(Patient(1)))
     drive = line.attach(Patient(1))
     begun = line.seconds
@@ -273,7 +275,7 @@ def test_a_stop_scripts_waits_end_at_its_time_limit() -> None:
     assert len(line.written) == 1
 
 
-def test_a_stop_of_all_drives_is_repeated_for_the_given_time_only() -> None:
+def test_stop_all_repeats_stops_for_the_given_time() -> None:
     sims: list[Any] = [simulated(InvtCHE(1, maximum_frequency=50)), simulated(ErmanERG220(2))]
     line = SimulatedBus(*sims)
     for sim in sims:
@@ -291,7 +293,7 @@ def test_a_stop_of_all_drives_is_repeated_for_the_given_time_only() -> None:
     }
 
 
-def test_a_stop_that_waits_for_its_drive_does_not_delay_another_stop() -> None:
+def test_a_stop_waiting_for_a_busy_drive_does_not_delay_other_stops() -> None:
     """The other motor ramps down and is read in the meantime."""
     line, _, sims = che_drives(2, hz=50, runs_s=20)
     ready_at = line.seconds + 3
@@ -309,7 +311,7 @@ def test_a_stop_that_waits_for_its_drive_does_not_delay_another_stop() -> None:
     assert of_others[0] < ready_at - 2 < ready_at <= rested[0] < ready_at + 0.5 < of_others[-1]
 
 
-def test_a_lost_read_is_not_repeated_before_the_stop_is_sent_again() -> None:
+def test_a_stop_is_sent_again_immediately_after_a_lost_read() -> None:
     line, drive, _ = one(YD1000(1))
     line.bus.check_identity(drive)
     begun = len(line.frames)
@@ -318,7 +320,7 @@ def test_a_lost_read_is_not_repeated_before_the_stop_is_sent_again() -> None:
     assert [is_write(request) for request, _ in line.frames[begun : begun + 3]] == [True, False, True]
 
 
-def test_a_stop_waits_for_late_replies_only_after_its_first_write(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_waits_for_late_replies_only_after_the_first_write(monkeypatch: pytest.MonkeyPatch) -> None:
     """Waiting lets a stop be confirmed if replies are late. It does not delay other drives' first stops."""
     line, drive, _ = one(InvtCHE(1, maximum_frequency=50))
     line.bus.check_identity(drive)
@@ -336,7 +338,7 @@ def test_a_stop_waits_for_late_replies_only_after_its_first_write(monkeypatch: p
 
 
 @pytest.mark.slow
-def test_the_repetition_and_the_end_of_a_stop_are_logged_once(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_repeated_stop_logs_one_warning_and_one_result(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "multidrop.control")
     line, drive, _ = one(InvtCHE(1, maximum_frequency=50))
     deaf_until = line.seconds + 20
@@ -351,7 +353,7 @@ def test_the_repetition_and_the_end_of_a_stop_are_logged_once(caplog: pytest.Log
     assert ends[0].startswith("invt-che@1: stopped after 2")
 
 
-def test_an_emergency_stop_that_trips_the_drive_is_sent_only_once() -> None:
+def test_an_emergency_stop_is_sent_only_once_if_the_drive_trips() -> None:
     line, drive, sim = one(YD1000(1))
     drive.set_frequency(20)
     drive.start()
@@ -430,7 +432,7 @@ def test_a_stop_on_a_closed_port_raises_immediately() -> None:
     assert line.seconds - begun < 0.1
 
 
-def test_the_stops_of_a_line_share_the_wait_for_a_slow_port(
+def test_stops_of_twenty_drives_share_one_wait_for_a_lost_port(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A server that is switched off may delay each attempt to connect for five seconds."""
@@ -472,7 +474,7 @@ class Careless(Own):
 
 
 @pytest.mark.parametrize("failure", [PortLost("hall", "unplugged"), None])
-def test_a_stop_whose_script_ignores_failures_is_not_reported_as_done(failure: BaseException | None) -> None:
+def test_a_stop_is_not_reported_as_done_if_the_script_ignores_failures(failure: BaseException | None) -> None:
     """The stop is repeated, although its script has ended."""
     line = SimulatedBus(simulated(Careless(1)))
     drive = line.attach(Careless(1))
@@ -505,7 +507,7 @@ def test_a_stop_is_sent_without_a_writable_ledger(tmp_path: Path, caplog: pytest
     assert "stops were not counted" in caplog.text
 
 
-def test_a_stop_whose_reply_is_lost_is_sent_again_before_any_read() -> None:
+def test_a_stop_is_sent_again_before_reads_if_replies_are_lost() -> None:
     """Although the value could be read back, the stop is sent again first."""
     line = SimulatedBus(simulated(Own(1)))
     drive = line.attach(Own(1))
@@ -538,7 +540,7 @@ def test_a_stop_is_sent_and_counted_although_the_eeprom_budget_is_spent(tmp_path
     assert wear.writes == 4
 
 
-def test_a_write_cancelled_by_a_stop_is_not_counted(tmp_path: Path) -> None:
+def test_the_eeprom_ledger_does_not_count_cancelled_writes(tmp_path: Path) -> None:
     for frames in range(1, 100):
         ledger = Ledger(tmp_path / f"wear-{frames}")
         line, drive, sim = one(DelixiModbus(1), ledger=ledger)
@@ -583,7 +585,7 @@ def test_other_drives_are_stopped_if_a_stop_script_raises() -> None:
     assert "division by zero" in found["breaks"].why
 
 
-def test_a_stop_with_a_single_write_is_repeated_until_it_is_answered() -> None:
+def test_a_stop_of_one_write_is_repeated_until_the_drive_answers() -> None:
     line = SimulatedBus(simulated(Own(1)))
     drive = line.attach(Own(1))
     line.deafens = lambda request: line.seconds < 1010
@@ -709,7 +711,7 @@ class Meter(Drive):
     power = reading(1, "W")
 
 
-def test_a_stop_of_a_whole_line_skips_a_device_without_a_motor(
+def test_stop_all_skips_devices_without_a_motor(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     flush_log(60)

@@ -51,7 +51,7 @@ def line(model: str) -> Iterator[tuple[Bus, Any, ReceivedRequests, Delayed]]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("model", usually(*MAKE))
-def test_a_constantly_delayed_line_does_not_prevent_a_stop(model: str) -> None:
+def test_a_stop_is_sent_although_every_reply_is_late(model: str) -> None:
     """Each reply arrives after the next request, so the read before the stop gets an earlier read's reply."""
     with line(model) as (_, drive, received, wire):
         received.sim.motor.run(1)
@@ -79,7 +79,7 @@ def in_thread(act: Callable[[], object]) -> tuple[threading.Thread, list[BaseExc
 
 @pytest.mark.long
 @pytest.mark.parametrize(("what", "ending"), in_turn(["start", "write", "raw"], ["close", "detach"]))
-def test_a_write_in_flight_is_unconfirmed_when_another_thread_closes(
+def test_closing_or_detaching_makes_a_write_in_flight_unconfirmed(
     monkeypatch: pytest.MonkeyPatch, ending: str, what: str
 ) -> None:
     """The write is never reported as unsent."""
@@ -136,7 +136,7 @@ def test_a_stop_of_another_thread_cancels_a_start_that_waits_for_a_reply(model: 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("model", usually(*MAKE))
-def test_a_start_whose_reply_is_lost_is_sent_once(model: str) -> None:
+def test_a_start_is_sent_once_if_the_reply_is_lost(model: str) -> None:
     with line(model) as (_, drive, received, _):
         drive.set_frequency(20)
         received.loses = lambda request: request in received.starts
@@ -149,7 +149,7 @@ def test_a_start_whose_reply_is_lost_is_sent_once(model: str) -> None:
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(("model", "lost"), in_turn(MAKE, [3, 2, 7]))
-def test_a_stop_whose_replies_are_lost_is_repeated_unchanged(model: str, lost: int) -> None:
+def test_a_stop_is_repeated_unchanged_if_replies_are_lost(model: str, lost: int) -> None:
     with line(model) as (_, drive, received, _):
         drive.set_frequency(20)
         drive.start()

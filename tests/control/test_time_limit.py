@@ -66,7 +66,7 @@ def test_a_call_delayed_past_its_time_limit_raises_expired(line: SimulatedBus, s
 
 
 @pytest.mark.parametrize("slept_before", [0, 3600])
-def test_a_time_limit_does_not_count_sleep_before_it_starts(line: SimulatedBus, slept_before: float) -> None:
+def test_computer_sleep_before_a_time_limit_is_not_counted(line: SimulatedBus, slept_before: float) -> None:
     line.slept += slept_before
     before = len(written(line))
     with within(line, 0.5):
@@ -137,7 +137,7 @@ def test_a_stop_is_sent_after_the_time_limit(line: SimulatedBus) -> None:
     assert len(written(line)) > before
 
 
-def test_a_stop_within_the_deadline_function_cancels_the_write(line: SimulatedBus) -> None:
+def test_a_stop_called_in_the_limit_function_cancels_the_write(line: SimulatedBus) -> None:
     """A program can therefore check for stops in its `limit` function, and misses none."""
     drive = line.bus.drives[0]
     before = len(written(line))
@@ -152,7 +152,7 @@ def test_a_stop_within_the_deadline_function_cancels_the_write(line: SimulatedBu
 
 
 @table("limit", [0.5, True, "1", None])
-def test_an_invalid_time_limit_prevents_writes_but_no_stop(limit: Any) -> None:
+def test_an_invalid_time_limit_prevents_writes_but_not_stops(limit: Any) -> None:
     line, drive, _ = one(InvtCHE(1, maximum_frequency=50))
     with written_before(limit):
         for call in (lambda: drive.set_frequency(20), drive.start):
@@ -194,13 +194,13 @@ class Resting(Own):
 
 
 @table("model", MAKE)
-def test_a_start_delayed_during_its_checks_is_not_sent(tmp_path: Path, model: str) -> None:
+def test_a_start_is_not_sent_if_the_process_was_suspended_during_checks(tmp_path: Path, model: str) -> None:
     """The process is suspended at each read, as by Ctrl-Z."""
     check_not_sent(tmp_path, model, lambda line: line.sleep(5))
 
 
 @table("model", MAKE)
-def test_a_start_is_not_sent_if_the_computer_slept_during_its_checks(tmp_path: Path, model: str) -> None:
+def test_a_start_is_not_sent_if_the_computer_slept_during_checks(tmp_path: Path, model: str) -> None:
     """CLOCK_MONOTONIC does not advance during sleep, so by that clock the start is not late."""
 
     def sleep_for_a_night(line: SimulatedBus) -> None:
@@ -226,7 +226,7 @@ def test_a_start_does_not_expire_because_of_slow_reads() -> None:
 
 
 @pytest.mark.parametrize(("more", "is_sent"), [(0.25, True), (0.35, False)])
-def test_a_start_does_not_expire_if_its_reads_end_in_time(more: float, is_sent: bool) -> None:
+def test_a_start_expires_only_if_a_read_takes_too_long(more: float, is_sent: bool) -> None:
     """A read may take as long as its timeout, two silences and 64 characters together."""
     line = SimulatedBus(simulated(Looking(1)))
     drive = line.attach(Looking(1, confirmed=1, silence=0.1))
@@ -293,7 +293,7 @@ with Bus(sys.argv[1], expiry=600) as bus:
 
 @pytest.mark.long
 @pytest.mark.parametrize("sleeps", [True, False])
-def test_a_start_is_not_sent_when_the_computer_wakes(tmp_path: Path, sleeps: bool) -> None:
+def test_a_start_is_not_sent_after_the_computer_wakes_up(tmp_path: Path, sleeps: bool) -> None:
     sim = simulated(InvtCHE(1, maximum_frequency=50))
     assert isinstance(sim, MotorDrive)
     sim.motor.deceleration_time = 0.2

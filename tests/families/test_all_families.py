@@ -178,7 +178,7 @@ def test_every_framing_of_a_family_has_character_formats(family: type[Drive]) ->
 
 
 @family
-def test_the_read_limits_of_a_family_are_for_its_own_tables(family: type[Drive]) -> None:
+def test_read_limits_name_only_register_tables_of_the_family(family: type[Drive]) -> None:
     tables = {register.table for register in family.registers.values()}
     assert {*family.most_registers, *family.readable_gaps} <= tables
 
@@ -226,7 +226,7 @@ def test_the_named_values_survive_encoding_and_decoding(family: type[Drive], reg
 
 
 @family
-def test_a_register_is_not_writable_if_it_is_declared_as_never_written(family: type[Drive]) -> None:
+def test_registers_declared_as_never_written_are_not_writable(family: type[Drive]) -> None:
     assert not [register for register in family.registers.values() if register.never and register.writable]
 
 
@@ -374,7 +374,7 @@ def test_every_call_of_a_script_uses_yield_from() -> None:
         assert forgotten(ast.Module([ast.Expr(call)], []), scripts) == [call.lineno]
 
 
-def test_verb_that_a_family_lacks_raises_unsupported() -> None:
+def test_a_verb_missing_from_a_family_raises_unsupported() -> None:
     class Mute(Drive):
         """A drive without verbs."""
 
@@ -399,7 +399,7 @@ UNDOCUMENTED = {  # verbs that a family's document does not describe, by family
 
 
 @family
-def test_verbs_not_in_the_document_are_unsupported_and_send_nothing(family: type[Drive]) -> None:
+def test_undocumented_verbs_raise_unsupported(family: type[Drive]) -> None:
     wire = Wire(family(1))
     missing = {name for name in VERBS if getattr(family, name) is getattr(Drive, name)}
     assert missing == UNDOCUMENTED[family.model]

@@ -77,7 +77,7 @@ def test_delixi_line_settings_and_limits_are_those_of_the_document() -> None:
         DelixiModbus(1, framing="ascii", format="8N2")
 
 
-def test_delixi_run_words_have_a_direction_and_never_the_toggle_bit() -> None:
+def test_delixi_control_words_never_set_the_toggle_bit() -> None:
     assert {each.value for each in DelixiModbusControl} == {0x00, 0x01, 0x12, 0x22, 0x13, 0x23}
 
 
@@ -163,7 +163,7 @@ def test_delixi_start_of_a_turning_motor_without_a_direction_is_refused() -> Non
     assert wire.sent == [MODBUS_FORWARD[Framing.RTU]]
 
 
-def test_delixi_stop_waits_for_0_hz_and_raises_if_it_does_not_come() -> None:
+def test_delixi_stop_waits_until_the_output_frequency_is_0() -> None:
     wire = Wire(DelixiModbus(1), {"output_frequency": [30.0, 10.0, 0.0]})
     wire.drive.stop()
     assert len(wire.reads) == 3
@@ -173,7 +173,7 @@ def test_delixi_stop_waits_for_0_hz_and_raises_if_it_does_not_come() -> None:
     assert wire.sent == [MODBUS_STOP[Framing.RTU]]
 
 
-def test_delixi_setpoint_write_wears_eeprom_and_a_wrong_value_is_reported() -> None:
+def test_delixi_setpoint_write_raises_if_the_drive_keeps_another_value() -> None:
     assert DelixiModbus.frequency.kept is Kept.EEPROM
     assert "EEPROM" in DelixiModbus.frequency.note
     wire = Wire(DelixiModbus(1), {"frequency": 40.0})
@@ -189,7 +189,7 @@ def test_delixi_setpoint_write_wears_eeprom_and_a_wrong_value_is_reported() -> N
         ({"fault": 99}, State(Condition.FAULT, fault="99")),
     ],
 )
-def test_delixi_state_shows_the_fault_or_that_the_motor_turns(says: dict[str, object], state: State) -> None:
+def test_delixi_state_shows_a_fault_or_a_turning_motor(says: dict[str, object], state: State) -> None:
     assert Wire(DelixiModbus(1), says).drive.state() == state
 
 
@@ -217,7 +217,9 @@ def test_delixi_identity_check_compares_address_and_baud_rate() -> None:
         ("frequency", 0.0, "set_frequency"),
     ],
 )
-def test_delixi_start_needs_line_control_and_no_fault(name: str, held: float, sentence: str) -> None:
+def test_delixi_start_is_refused_with_a_fault_or_wrong_settings(
+    name: str, held: float, sentence: str
+) -> None:
     wire = Wire(DelixiModbus(1), {**MODBUS_STANDING, name: held})
     with pytest.raises(WriteForbidden, match=sentence):
         wire.drive.start()
@@ -339,7 +341,9 @@ def test_delixi_native_start_is_refused_if_the_motor_could_start_later(status: i
         ({"fault": DelixiFault.OC_OVERCURRENT}, "has a fault, overcurrent .OC.: remove the cause"),
     ],
 )
-def test_delixi_native_start_needs_line_control_and_no_fault(says: dict[str, object], sentence: str) -> None:
+def test_delixi_native_start_is_refused_under_panel_control_or_with_a_fault(
+    says: dict[str, object], sentence: str
+) -> None:
     wire = Wire(DelixiNative(1), NATIVE_STANDING | says, turns=NATIVE_TURNS)
     wire.drive.set_frequency(50)
     with pytest.raises(WriteForbidden, match=sentence):
@@ -458,7 +462,7 @@ class Owned(DelixiNative):
     stored_ramp = setting(parameter(0, 18), "s", step=0.1, table=PARAMETER)
 
 
-def test_table_of_a_delixi_parameter_selects_ram_or_eeprom() -> None:
+def test_register_table_of_a_delixi_parameter_selects_ram_or_eeprom() -> None:
     assert (Owned.ramp.kept, Owned.stored_ramp.kept) == (Kept.RAM, Kept.EEPROM)
     kept = {name: each.kept for name, each in DelixiNative.registers.items() if each.writable}
     assert kept == {
@@ -471,7 +475,7 @@ def test_table_of_a_delixi_parameter_selects_ram_or_eeprom() -> None:
         setting(parameter(0, 17), "s", table=PARAMETER, kept=Kept.RAM)
 
 
-def test_delixi_writes_to_eeprom_are_limited_and_writes_to_ram_are_not(tmp_path: Path) -> None:
+def test_delixi_write_limit_applies_to_eeprom_but_not_ram(tmp_path: Path) -> None:
     ledger = Ledger(tmp_path / "wear", budget=1000)
     line, drive, sim = one(Owned(1), ledger=ledger)
     for seconds in (1.0, 2.0, 3.0):
@@ -485,7 +489,7 @@ def test_delixi_writes_to_eeprom_are_limited_and_writes_to_ram_are_not(tmp_path:
 
 
 @table("status", [DelixiNativeStatus.FAULT, DelixiNativeStatus.UNDERVOLTAGE])
-def test_delixi_fault_that_remains_after_a_reset_is_reported(status: DelixiNativeStatus) -> None:
+def test_delixi_reset_raises_if_the_fault_remains(status: DelixiNativeStatus) -> None:
     wire = Wire(DelixiNative(1), {**NATIVE_STANDING, "status": status, "fault": DelixiFault.OC_OVERCURRENT})
     with pytest.raises(NotVerified, match=r"the fault reset.*the fault remains: overcurrent"):
         wire.drive.reset_fault()

@@ -134,14 +134,14 @@ def test_erman_start_is_refused_until_the_last_fault_is_reset() -> None:
 
 
 @table("fault", ErmanFault)
-def test_erman_fault_must_be_acknowledged_with_the_option(fault: ErmanFault) -> None:
+def test_erman_start_is_refused_until_a_fault_is_acknowledged(fault: ErmanFault) -> None:
     wire = Wire(ErmanERG220(1), {**STOPPED, "last_fault": fault}, turns=TURNS)
     with pytest.raises(WriteForbidden, match=f"acknowledged_fault = {int(fault)}"):
         wire.drive.start()
     assert wire.sent == []
 
 
-def test_an_erman_starts_after_a_fault_that_its_owner_acknowledged() -> None:
+def test_erman_starts_after_a_fault_acknowledged_by_option() -> None:
     wire = Wire(
         ErmanERG220(1, acknowledged_fault=64), {**STOPPED, "last_fault": ErmanFault.OVERHEAT}, turns=TURNS
     )
@@ -149,7 +149,7 @@ def test_an_erman_starts_after_a_fault_that_its_owner_acknowledged() -> None:
     assert wire.sent[-1] == START_ON
 
 
-def test_erman_stop_sets_the_stop_coil_and_clears_start_and_waits() -> None:
+def test_erman_stop_sets_the_stop_coil_and_clears_the_start_coil() -> None:
     wire = Wire(
         ErmanERG220(1),
         {
@@ -164,7 +164,7 @@ def test_erman_stop_sets_the_stop_coil_and_clears_start_and_waits() -> None:
     assert wire.reads.count("status") == 4
 
 
-def test_erman_stop_without_effect_is_followed_by_emergency_stop_and_raises() -> None:
+def test_erman_stop_without_effect_is_followed_by_an_emergency_stop() -> None:
     wire = Wire(ErmanERG220(1), {**STOPPED, "status": ErmanStatus.RUNNING})
     with pytest.raises(Unconfirmed, match="does not report a stop within"):
         wire.drive.stop()
@@ -258,7 +258,7 @@ def test_erman_emergency_stop_sets_its_coil_and_clears_the_start_coil() -> None:
         wire.drive.emergency_stop()
 
 
-def test_erman_reset_clears_start_first_and_its_own_coil_afterwards() -> None:
+def test_erman_fault_reset_pulses_the_reset_coil_after_clearing_start() -> None:
     wire = Wire(ErmanERG220(1), STOPPED)
     wire.drive.reset_fault()
     assert wire.sent == [START_OFF, RESET_ON, RESET_OFF]
@@ -314,7 +314,7 @@ def test_the_erman_state_mentions_the_last_fault(
     assert (state.condition, state.note, state.fault) == (condition, note, None)
 
 
-def test_erman_last_fault_with_only_unnamed_bits_counts_as_a_fault() -> None:
+def test_reserved_erman_fault_bits_count_as_a_fault() -> None:
     """Bits 8, 9 and 12 to 31 of the last fault are reserved (section 10, state registers 1026-1027)."""
     wire = Wire(ErmanERG220(1), {**STOPPED, "last_fault": ErmanERG220.last_fault.decode(0x1100)}, turns=TURNS)
     assert "last fault bit 8, bit 12" in wire.drive.state().note
@@ -331,8 +331,8 @@ def test_an_erman_without_register_0400h_fails_the_identity_check() -> None:
         Wire(ErmanERG220(1), {"status": NoReply("drive")}).drive.identify()
 
 
-def test_erman_coils_are_read_within_one_byte_and_only_on_request() -> None:
-    """The order of two bytes in a reply is doubtful (section 6, the example of function 01)."""
+def test_one_read_of_erman_coils_never_spans_two_bytes() -> None:
+    """The order of two bytes in a reply is doubtful (section 6). Coils are read only on request."""
     line, drive, _ = one(ErmanERG220(1))
     coils = [drive.start_held, drive.stop_held, drive.emergency_stop_held, drive.fault_reset_held]
     assert not set(coils) & set(drive.readings())

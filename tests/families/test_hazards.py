@@ -342,7 +342,7 @@ class Mine(InvtCHE):
 
 
 @pytest.mark.parametrize("hazard", HAZARDS.values(), ids=HAZARDS)
-def test_hazardous_command_sends_only_documented_safe_frames_or_is_refused(hazard: Hazard) -> None:
+def test_hazardous_commands_send_safe_frames_or_are_refused(hazard: Hazard) -> None:
     line, drive, sim = one(hazard.drive())
     for name, value in hazard.shows.items():
         sim[name] = value
@@ -392,7 +392,7 @@ def test_erman_reply_with_another_byte_count_is_rejected() -> None:
 
 
 @table("code", [2, 3, 4])
-def test_erman_exception_for_a_bad_address_is_no_device_failure(code: int) -> None:
+def test_erman_address_exception_is_not_reported_as_a_device_failure(code: int) -> None:
     """Erratum E12."""
     assert "address" in ErmanERG220(1).exception(code)
     assert "fail" not in ErmanERG220(1).exception(code)
@@ -413,7 +413,7 @@ def test_erman_has_no_registers_for_diagnostics_or_at_unknown_addresses() -> Non
     )
 
 
-def test_a_request_is_repeated_if_an_invt_che_received_it_damaged() -> None:
+def test_a_request_is_repeated_if_an_invt_che_reports_a_checksum_error() -> None:
     """Erratum I4."""
     line, drive, _ = one(InvtCHE(1))
     line.refuses = lambda request: 0x11 if len(line.frames) == 1 else 0
@@ -510,7 +510,7 @@ def test_delixi_fault_04_is_an_overvoltage() -> None:
 
 
 @pytest.mark.parametrize("code", [1, 2, 0x42])
-def test_every_exception_code_is_a_refusal(code: int) -> None:
+def test_any_exception_code_raises_drive_exception(code: int) -> None:
     """Errata D13, Y15."""
     for make in (delixi, yd):
         line, drive, _ = one(make())
@@ -535,7 +535,7 @@ def test_yd1000_uses_only_functions_03_and_06_and_never_address_0() -> None:
         YD1000(0)
 
 
-def test_yd1000_frame_lengths_are_not_those_of_the_manual() -> None:
+def test_yd1000_frames_have_modbus_lengths_despite_the_manual() -> None:
     """Errata Y3, Y4."""
     assert len(build_request(Framing.RTU, Message(1, 6, 0x1001, data=b"\x1f\x40"))) == 8
     request = Message(1, 3, 0x1100, 1)
@@ -543,7 +543,7 @@ def test_yd1000_frame_lengths_are_not_those_of_the_manual() -> None:
     assert (used, reply and reply.data) == (7, b"\x13\x88")
 
 
-def test_frozen_yd1000_status_is_not_reported_as_running() -> None:
+def test_a_yd1000_trip_is_reported_although_the_status_is_frozen() -> None:
     """Erratum Y8."""
     line, drive, sim = one(YD1000(1))
     run(line, drive, sim)
@@ -562,7 +562,7 @@ def test_factory_value_of_the_yd1000_watchdog_is_unknown() -> None:
     assert YD1000.communication_timeout.default is None
 
 
-def test_registers_kept_in_eeprom_are_declared_as_eeprom() -> None:
+def test_yd1000_registers_outside_ram_are_declared_as_eeprom() -> None:
     """Erratum 0.8."""
     for register in YD1000.registers.values():
         in_ram = 0x1000 <= register.address <= 0x12FF
@@ -595,7 +595,7 @@ OF_PRINT_ALONE = {
 }
 
 
-def test_every_erratum_of_a_document_has_a_test_or_a_reason_for_having_none() -> None:
+def test_every_erratum_has_a_test_or_a_stated_reason() -> None:
     tests = [test for name, test in globals().items() if name.startswith("test_")]
     names = [*HAZARDS, *(test.__doc__ or "" for test in tests)]
     for family, last in FAMILIES.items():

@@ -121,7 +121,7 @@ def test_innovert_ibd_reset_bit_is_cleared_although_the_reset_is_unconfirmed() -
     assert wire.sent == [STOP[Framing.RTU], RESET, STOP[Framing.RTU]]
 
 
-def test_innovert_ibd_is_not_started_if_a_missing_reply_hides_how_it_shows_a_fault() -> None:
+def test_innovert_ibd_start_fails_if_an_output_setting_is_unreadable() -> None:
     faulty = {**STANDING, **PROGRAMMED, "terminals": Terminals.VIRTUAL, "output_m02": NoReply("drive")}
     wire = Wire(InnovertIBD(1), faulty)
     wire.drive.set_frequency(50)
@@ -131,7 +131,7 @@ def test_innovert_ibd_is_not_started_if_a_missing_reply_hides_how_it_shows_a_fau
     wire.drive.stop()  # confirmed by speed and current
 
 
-def test_innovert_ibd_gets_a_stop_before_the_fault_reset() -> None:
+def test_innovert_ibd_fault_reset_sends_a_stop_first() -> None:
     """By table 3, the reset word leaves the run command unchanged. So an earlier run may still be active."""
     stop = STOP[Framing.RTU]
     lost = [Unconfirmed("drive", "stop", "no reply")] * 3
@@ -216,14 +216,16 @@ def test_innovert_ibd_start_after_jog_and_stop_runs_at_the_setpoint() -> None:
         ({}, "set_frequency"),
     ],
 )
-def test_innovert_ibd_start_needs_a_setup_and_no_fault(says: dict[str, object], sentence: str) -> None:
+def test_innovert_ibd_start_is_refused_with_a_fault_or_wrong_settings(
+    says: dict[str, object], sentence: str
+) -> None:
     wire = Wire(InnovertIBD(1), {**STANDING, "terminals": Terminals(0), **says})
     with pytest.raises(WriteForbidden, match=sentence):
         wire.drive.start()
     assert wire.sent == []
 
 
-def test_innovert_ibd_identity_check_needs_its_address_or_a_confirmation() -> None:
+def test_innovert_ibd_identity_check_compares_address_and_baud_rate() -> None:
     says = {"baudrate_setting": IBDBaudrate.B9600, "address_setting": 1}
     Wire(InnovertIBD(1), says).drive.identify()
     for other in (
@@ -256,7 +258,7 @@ SEEN = {
 
 
 @table("name", SEEN)
-def test_drive_that_lacks_a_register_does_not_resemble_an_innovert_ibd(name: str) -> None:
+def test_a_drive_without_ibd_registers_is_not_taken_for_an_ibd(name: str) -> None:
     def resembles(says: dict[str, object]) -> bool:
         wire = Wire(InnovertIBD(1), says)
         found = wire.run(wire.drive.resembles())
@@ -337,7 +339,7 @@ def test_innovert_ibd_registers_with_inferred_addresses_are_never_written() -> N
         ({"fault": reading(300, part=(0, 0))}, "it is 0 only without a fault"),
     ],
 )
-def test_a_sibling_of_the_ibd_needs_a_state_that_is_0_only_at_rest(
+def test_invalid_run_state_or_fault_of_an_ibd_subclass_is_refused(
     register: dict[str, object], mistake: str
 ) -> None:
     with pytest.raises(DeclarationError, match=mistake):

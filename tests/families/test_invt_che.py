@@ -84,7 +84,7 @@ def test_invt_che_registers_equal_the_table_of_the_che100_manual() -> None:
     assert signed == {"setpoint", "output_power", "output_torque"}
 
 
-def test_invt_che_scales_on_which_sources_differ_are_not_declared() -> None:
+def test_invt_che_values_of_disputed_scale_are_raw_counts() -> None:
     """By an owner's log of a CHF100A, 3006H is in 0.01 kW. By the Goodrive300L manual, it is in 0.1 %."""
     for register, raw in ((InvtCHE.output_power, 262), (InvtCHE.dc_bus_voltage, 5370)):
         assert register.value_unit == "raw count"
@@ -212,7 +212,7 @@ def test_the_command_stop_jog_is_sent_if_the_state_is_unknown(unseen: BusError) 
     assert wire.sent == [STOP, STOP_JOG]
 
 
-def test_the_command_stop_jog_is_not_sent_to_another_make() -> None:
+def test_invt_che_stop_jog_is_not_sent_to_another_family() -> None:
     wire = Wire(
         InvtCHE(1), {"status": CHEStatus.FORWARD}, {STOP: [WriteForbidden("another family is there")]}
     )
@@ -229,7 +229,7 @@ def test_invt_che_state_is_read_even_after_a_refused_stop_jog() -> None:
     assert wire.sent == [STOP] + [STOP_JOG] * 3
 
 
-def test_invt_che_stop_that_is_refused_at_rest_counts_as_done() -> None:
+def test_invt_che_stop_counts_as_done_if_refused_at_rest() -> None:
     refusal = DriveException("drive", 1, "")
     wire = Wire(InvtCHE(1), {"status": CHEStatus.FAULT}, {STOP: [refusal] * 3})
     wire.drive.stop()
@@ -325,14 +325,14 @@ def test_invt_che_status_word_decodes_to_the_state(says: dict[str, object], stat
     assert Wire(InvtCHE(1), says).drive.state() == state
 
 
-def test_invt_che_identify_refuses_other_makes() -> None:
+def test_invt_che_identity_check_refuses_other_device_codes() -> None:
     for device in (0x0101, 0x0102):
         Wire(InvtCHE(1), {"device": InvtCHE.device.decode(device)}).drive.identify()
     with pytest.raises(WriteForbidden, match="010AH"):
         Wire(InvtCHE(1), {"device": InvtCHE.device.decode(0x010A)}).drive.identify()
 
 
-def test_invt_che_parameter_of_a_user_is_written_to_its_ram_address() -> None:
+def test_user_declared_invt_che_parameter_is_written_to_the_ram_address() -> None:
     class Mine(InvtCHE):
         """A user's family with parameters from the drive's manual."""
 

@@ -412,7 +412,7 @@ def values(drive: Any, names: Mapping[str, float]) -> dict[str, float]:
     return {name: drive.read(name) for name in names}
 
 
-def test_each_of_the_25_families_has_a_responder() -> None:
+def test_each_of_the_25_families_has_an_independent_simulated_drive() -> None:
     assert {*SHEETS} == {*MODELS, *SHIPPED}
     assert len(SHEETS) == 25
 

@@ -82,7 +82,7 @@ class Pair:
 
 @every_declaration
 @table("there", THERE)
-def test_no_command_is_sent_to_a_drive_of_another_make(declared: str, there: str) -> None:
+def test_no_command_is_sent_to_a_drive_of_another_family(declared: str, there: str) -> None:
     if declared == there or same_words(declared, there):
         return
     pair = Pair(declared, there, turns=False)
@@ -96,7 +96,7 @@ def test_no_command_is_sent_to_a_drive_of_another_make(declared: str, there: str
 @pytest.mark.parametrize("turns", usually(True, False), ids=["turning", "at rest"])
 @every_declaration
 @table("there", THERE)
-def test_a_stop_never_starts_a_drive_of_another_make(declared: str, turns: bool, there: str) -> None:
+def test_a_stop_never_starts_a_drive_of_another_family(declared: str, turns: bool, there: str) -> None:
     if declared == there or same_words(declared, there):
         return
     pair = Pair(declared, there, turns)
@@ -125,7 +125,7 @@ def test_a_stop_never_starts_a_drive_of_another_make(declared: str, turns: bool,
 
 
 @table(("declared", "there"), [(one, other) for one, others in RUNS_AT_A_STOP.items() for other in others])
-def test_the_documentation_lists_stops_that_would_start_other_makes(declared: str, there: str) -> None:
+def test_the_documentation_lists_stops_that_would_start_other_families(declared: str, there: str) -> None:
     page = (Path(__file__).parents[2] / "docs" / "reference" / "profiles.md").read_text("utf-8")
     rows = [row.split("|") for row in page.splitlines() if re.search(r"\| 000[16]H \|", row)]
     assert any(f"`{declared}`" in row[1] and f"`{there}`" in row[3] for row in rows)
@@ -219,7 +219,7 @@ def ask(sim: Any, drive: Drive, request: Message) -> Message:
 
 
 @table("there", [*RECOGNISABLE, "invt-che", "yd1000", "delixi-modbus"])
-def test_a_scan_finds_drives_that_identify_themselves(there: str) -> None:
+def test_a_scan_recognises_drives_by_their_identity_registers(there: str) -> None:
     drive = THERE[there](1)
     sweep = Sweep(drive.settings, drive.framing, (), ScanRequest(3, 0, 1), (1,), 0.0, 0.0)
     found, doubt = identify(sweep, 1, SCANNED, partial(ask, simulated(drive)))

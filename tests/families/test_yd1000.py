@@ -149,7 +149,7 @@ def test_yd1000_registers_are_declared_as_ram_or_eeprom() -> None:
     assert ram == {"control", "frequency", "panel_frequency"}
 
 
-def test_yd1000_registers_that_are_never_written_are_those_of_the_document() -> None:
+def test_yd1000_registers_never_written_have_documented_reasons() -> None:
     never: dict[str, set[int]] = {}
     for register in YD1000.registers.values():
         never.setdefault(register.never, set()).add(register.address)
@@ -260,7 +260,9 @@ def test_yd1000_line_settings_and_limits_are_those_of_the_document() -> None:
         (YD1000Control(0), "01 06 10 00 00 00 8D 0A"),
     ],
 )
-def test_yd1000_words_without_bit_14_are_sent_as_documented(word: YD1000Control, printed: str) -> None:
+def test_yd1000_control_words_without_bit_14_are_sent_as_documented(
+    word: YD1000Control, printed: str
+) -> None:
     assert frame(YD1000(1), YD1000.control, word) == printed
 
 
@@ -285,7 +287,9 @@ def yd_word(word: int) -> str:
         ({}, 0xC400, 0xC600),
     ],
 )
-def test_yd1000_start_options_select_the_bits(options: dict[str, float], forward: int, reverse: int) -> None:
+def test_yd1000_options_select_the_control_bits_of_a_start(
+    options: dict[str, float], forward: int, reverse: int
+) -> None:
     words = [yd_word(forward), yd_word(reverse)]
     turns = dict(zip(words, (TURNS[FORWARD], TURNS[REVERSE]), strict=True))
     wire = Wire(YD1000(1, **options), AT_30_HZ, turns=turns)
@@ -302,7 +306,7 @@ def test_yd1000_start_without_a_setpoint_is_refused() -> None:
     assert wire.sent == []
 
 
-def test_yd1000_start_sends_no_setpoint_if_the_panel_selects_its_source() -> None:
+def test_yd1000_start_sends_no_setpoint_with_option_setpoint_by_fnod() -> None:
     wire = Wire(YD1000(1, setpoint_by_fnod=1), STANDING, turns={yd_word(0x8400): TURNS[FORWARD]})
     wire.drive.start()
     assert wire.sent == [yd_word(0x8400)]
@@ -358,7 +362,7 @@ def test_yd1000_jog_leaves_the_run_bit_off() -> None:
     assert [each[:17] for each in wire.sent] == ["01 06 10 00 C1 00", "01 06 10 00 C3 00"]
 
 
-def test_yd1000_stop_keeps_bit_15_and_waits_for_two_readings_of_0_hz() -> None:
+def test_yd1000_stop_waits_for_two_readings_of_0_hz() -> None:
     wire = Wire(YD1000(1), {**STANDING, "output_frequency": [20.0, 0.0, 3.0, 0.0, 0.0]})
     wire.drive.stop()
     assert wire.sent == [STOP]
@@ -372,7 +376,7 @@ def test_yd1000_stop_keeps_bit_15_and_waits_for_two_readings_of_0_hz() -> None:
     assert wire.sent == [STOP]
 
 
-def test_no_yd1000_verb_except_release_control_clears_bits_15_and_14() -> None:
+def test_yd1000_motor_verbs_keep_control_bits_15_and_14_set() -> None:
     wire = Wire(YD1000(1), AT_30_HZ, turns=TURNS)
     for verb in (
         wire.drive.start,
@@ -404,7 +408,7 @@ def test_yd1000_emergency_stop_is_sent_only_once(failure: Exception) -> None:
     assert wire.sent == [pulse, STOP]
 
 
-def test_yd1000_coast_sends_its_bit_and_waits_for_two_readings_of_0_hz() -> None:
+def test_yd1000_coast_waits_for_two_readings_of_0_hz() -> None:
     wire = Wire(YD1000(1), STANDING)
     wire.drive.coast()
     assert [each[:17] for each in wire.sent] == ["01 06 10 00 C8 00"]
@@ -477,7 +481,7 @@ FUNCTIONS = {f"input_{at}_function": factory for at, factory in enumerate((2.0, 
         ("release_control", " .* when the line releases control"),
     ],
 )
-def test_a_closed_run_terminal_prevents_a_yd1000_reset_or_release(
+def test_a_closed_run_terminal_blocks_yd1000_reset_and_release_control(
     says: dict[str, object], terminal: str, verb: str, consequence: str
 ) -> None:
     wire = Wire(YD1000(1), {**STANDING, **FUNCTIONS, **says})
@@ -493,7 +497,7 @@ def test_yd1000_terminals_without_a_run_function_do_not_block_a_reset(closed: In
     assert wire.sent == [frame(YD1000(1), YD1000.control, YD1000Control(0xE000)), STOP]
 
 
-def test_the_error_of_an_inferred_yd1000_limit_names_its_source() -> None:
+def test_yd1000_limit_error_names_the_section_of_the_manual() -> None:
     """The document limits the upper frequency limit by the maximum frequency; the reverse is inferred."""
     wire = Wire(YD1000(1), {**STANDING, "upper_limit_frequency": 60.0})
     with pytest.raises(
@@ -518,7 +522,7 @@ def test_yd1000_release_control_is_refused_unless_the_motor_is_at_rest() -> None
         assert wire.sent == []
 
 
-def test_yd1000_motor_that_turns_after_release_control_is_stopped_again() -> None:
+def test_yd1000_stop_is_written_if_the_motor_turns_after_release_control() -> None:
     turns = {RELEASE: {"output_frequency": [0.0, 0.0, 1.5]}}
     wire = Wire(YD1000(1), {**STANDING, **FUNCTIONS}, turns=TURNS | turns)
     with pytest.raises(

@@ -95,7 +95,7 @@ def test_the_saved_parameters_are_restored_after_a_factory_reset(tmp_path: Path,
 
 
 @pytest.mark.parametrize("family", FAMILIES)
-def test_running_motor_makes_apply_raise_and_write_nothing(family: type[Drive]) -> None:
+def test_apply_raises_while_the_motor_runs(family: type[Drive]) -> None:
     line, drive, sim = attached(made(family), EXTRA[family])
     first = writable(drive, EXTRA[family])[0]
     sim.motor.target = 50.0
@@ -183,7 +183,7 @@ def test_motor_identification_of_a_delixi_e_is_not_started() -> None:
     assert "identification of the motor" in params.plan(drive, {"P0.0.24": 1}).left["P0.0.24"]
 
 
-def test_parameter_that_the_drive_lacks_is_left_out() -> None:
+def test_parameters_unknown_to_the_drive_are_left_out() -> None:
     _, drive, _ = attached(YD1000(1), [])
     assert params.plan(drive, {"F240": 5}).left == {"F240": "the drive does not have it"}
 
@@ -310,7 +310,7 @@ def test_a_stop_while_parameters_are_read_cancels_all_writes(
 
 # `room` is the number of free bytes on the disk. Each number lets a different line of the journal fail.
 @table("room", [0, 100, 130, 160, 200, 230])
-def test_applying_parameters_can_be_completed_after_a_full_disk(
+def test_the_next_apply_completes_the_writes_after_a_full_disk(
     monkeypatch: pytest.MonkeyPatch, room: int
 ) -> None:
     line, drive, _ = attached(ErmanERG220(1), [])
@@ -343,7 +343,7 @@ def test_apply_returns_its_result_if_the_journal_cannot_be_removed(monkeypatch: 
     assert [change.parameter.code for change in done.written] == ["b.003"]
 
 
-def test_a_refused_second_write_suggests_the_command_that_permits_it() -> None:
+def test_the_error_of_a_refused_second_write_suggests_params_apply() -> None:
     _, drive, _ = attached(YD1000(1), [])
     drive.write("acceleration_time", 20.0)
     with pytest.raises(WriteForbidden, match=r"params\.apply") as refusal:
@@ -406,7 +406,7 @@ def lives(tmp_path: Path) -> Iterator[tuple[Lives, object]]:
 
 @pytest.mark.long
 @pytest.mark.parametrize("most", first_in_ci(10, 50))
-def test_the_writes_of_a_killed_apply_are_completed_by_the_next_apply(
+def test_the_next_apply_completes_the_writes_of_a_killed_apply(
     lives: tuple[Lives, object], tmp_path: Path, most: int
 ) -> None:
     killed, (sim, there) = lives

@@ -68,13 +68,13 @@ def test_a_refused_block_does_not_prevent_reading_the_other_blocks() -> None:
     assert counts(line) == [16, 8, 4, 4, 2, 1, 1, 2, 8, 16]
 
 
-def test_the_longest_block_that_the_drive_accepts_is_learnt() -> None:
+def test_params_read_remembers_the_longest_accepted_block() -> None:
     line, drive = blocky(set(), longest=8)
     assert len(params.read(drive).values) == 32
     assert counts(line) == [16, 8, 8, 8, 8]
 
 
-def test_a_read_with_codes_reads_only_these_parameters() -> None:
+def test_params_read_with_codes_reads_only_those_parameters() -> None:
     line, drive = blocky(set())
     assert dict(params.read(drive, ["P01.02"]).values) == {"P01.02": 18}
     assert counts(line) == [1]
@@ -82,7 +82,7 @@ def test_a_read_with_codes_reads_only_these_parameters() -> None:
         params.read(drive, ["P09.00"])
 
 
-def test_a_parameter_group_without_replies_is_abandoned() -> None:
+def test_reading_skips_the_rest_of_a_parameter_group_without_replies() -> None:
     line, drive, _ = one(DelixiModbus(1))
     found = params.read(drive).values
     assert [*found] == ["P00.00", "P00.01", "P00.02", "P04.28", "P04.29", "P04.30"]
@@ -111,7 +111,7 @@ ADDRESSES = [
 
 
 @table("model, code, address", ADDRESSES)
-def test_the_parameter_addresses_are_those_of_the_sources(model: str, code: str, address: int) -> None:
+def test_parameter_addresses_equal_the_cited_sources(model: str, code: str, address: int) -> None:
     assert parameters_of(find_model(model))[code].address == address
 
 
@@ -132,7 +132,7 @@ def test_hazardous_and_unexplained_parameters_are_not_written(model: str, codes:
     assert [code for code in codes.split() if not known[code].never] == []
 
 
-def test_a_delixi_e_parameter_without_explanation_is_not_writable() -> None:
+def test_only_explained_delixi_e_parameters_are_writable() -> None:
     """The file DelixiCDIE100.cpp explains these codes.
 
     The other codes in it are for commands, motor identification and communication.
@@ -176,7 +176,7 @@ def test_the_monitor_values_are_not_listed_as_parameters() -> None:
     assert not any(code.startswith("P05.") for code in parameters_of(DelixiModbus))
 
 
-def test_a_parameter_is_written_to_eeprom_even_if_its_register_has_a_ram_address() -> None:
+def test_parameters_use_the_eeprom_address_of_a_register() -> None:
     from multidrop.drive.register import Kept, setting
 
     class WithAlias(Drive):
@@ -214,13 +214,13 @@ def test_saving_parameters_to_an_existing_file_raises(tmp_path: Path) -> None:
         params.save(FOUND, tmp_path / "pump.txt")
 
 
-def test_a_set_without_parameters_is_not_saved(tmp_path: Path) -> None:
+def test_an_empty_parameter_set_is_not_saved(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"pump-1 returned no value of its parameters, so .* is not written"):
         params.save(params.ParameterSet("yd1000", {}, source="pump-1"), tmp_path / "pump.toml")
     assert not (tmp_path / "pump.toml").exists()
 
 
-def test_a_parameter_file_that_is_too_long_is_refused(tmp_path: Path) -> None:
+def test_an_oversized_parameter_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_bytes(b"#" * (files.MOST_BYTES + 1))
     with pytest.raises(ValueError, match="the parameter file has more than 1000000 bytes"):
         params.load(tmp_path / "a.csv")

@@ -111,7 +111,9 @@ def test_family_file_gives_the_same_values_as_the_equivalent_class(plant: Path) 
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.usefixtures("_unpainted")
-def test_a_plant_with_two_family_files_works(run: Run, plant: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_drives_of_two_family_files_can_be_scanned_and_polled(
+    run: Run, plant: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(plant.parent)
     lines = Plant.load(plant).lines
     drives = [simulated(polled.drive) for polled in lines[0].drives]
@@ -199,7 +201,7 @@ def test_family_file_without_commands_needs_no_confirmation(plant: Path) -> None
         ("above = 5\nbelow = 7", 7, False),
     ],
 )
-def test_a_family_file_recognises_drives_by_its_section_identify(
+def test_the_section_identify_of_a_family_file_recognises_drives(
     tmp_path: Path, proof: str, value: int, is_one: bool
 ) -> None:
     path = tmp_path / "meter.toml"

@@ -70,7 +70,7 @@ def test_class_from_a_family_file_equals_the_hand_written_class(tmp_path: Path) 
     assert (loaded.__name__, loaded.model, loaded.declared_in) == ("Meter", "meter.toml", "meter.toml")
 
 
-def test_the_values_in_a_family_file_are_read_by_name(tmp_path: Path) -> None:
+def test_named_values_in_a_family_file_are_decoded(tmp_path: Path) -> None:
     loaded = load_family(write_meter(tmp_path))
     assert loaded.register("mode").format(loaded.register("mode").decode(1)) == "automatic"
     alarms = loaded.register("alarms").decode(9)
@@ -646,7 +646,7 @@ def mutated(data: bytes, chosen: random.Random) -> bytes:
 @pytest.mark.slow
 @settings(max_examples=examples(300))
 @given(st.sampled_from(SEEDS), st.integers(0, 2**32))
-def test_damaged_family_file_loads_or_is_refused_with_sentences(seed: bytes, number: int) -> None:
+def test_damaged_family_file_raises_only_readable_errors(seed: bytes, number: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
         read("family", mutated(seed, random.Random(number)), Path(folder))
 

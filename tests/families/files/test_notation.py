@@ -36,7 +36,7 @@ from multidrop.families.files.notation import Counting, sent_as
         (40001, 0, "input", (40001, "input")),
     ],
 )
-def test_toml_addresses_are_converted(
+def test_toml_addresses_are_converted_to_wire_addresses(
     given: Any, counts_from: int | None, table: str | None, sent: tuple[int, str]
 ) -> None:
     assert Counting(counts_from).address(given, table, "holding") == sent
@@ -55,7 +55,9 @@ def test_toml_addresses_are_converted(
         ("0016", 0, (16, "holding")),
     ],
 )
-def test_csv_addresses_are_converted(cell: str, counts_from: int | None, sent: tuple[int, str]) -> None:
+def test_csv_addresses_are_converted_to_wire_addresses(
+    cell: str, counts_from: int | None, sent: tuple[int, str]
+) -> None:
     assert Counting(counts_from).address_in_cell(cell, None, "holding") == sent
 
 
@@ -91,7 +93,7 @@ def test_an_address_as_toml_text_is_read_back_unchanged(table: str) -> None:
         assert Counting(0).address(written, table, "holding") == (address, table)
 
 
-def test_address_whose_first_digit_contradicts_its_table_is_refused() -> None:
+def test_an_address_is_refused_if_the_first_digit_contradicts_the_table() -> None:
     with pytest.raises(
         ValueError, match='"30001" begins with 3, which stands for table input, but table = "holding"; '
     ):

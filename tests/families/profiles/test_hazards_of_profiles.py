@@ -93,7 +93,7 @@ def test_a_trip_during_a_start_is_reported(line: Line, monkeypatch: pytest.Monke
     assert len(line.starts) == 1
 
 
-def test_a_reset_never_starts_the_motor(line: Line) -> None:
+def test_a_fault_reset_never_starts_the_motor(line: Line) -> None:
     """The run command may still be set at the trip, and the drive may obey its level."""
     line.runs()
     line.sim.trip(FAULT)
@@ -113,7 +113,7 @@ def test_a_reset_never_starts_the_motor(line: Line) -> None:
 
 
 @pytest.mark.parametrize("lost", range(4))
-def test_a_reset_with_lost_replies_never_starts_the_motor(line: Line, lost: int) -> None:
+def test_a_fault_reset_with_lost_replies_never_starts_the_motor(line: Line, lost: int) -> None:
     line.runs()
     line.sim.trip(FAULT)
     begun = len(line.writes)
@@ -132,12 +132,12 @@ def test_a_reset_with_lost_replies_never_starts_the_motor(line: Line, lost: int)
     assert line.sim.motor.fault == FAULT  # the reset bit was cleared, so the new fault stays
 
 
-def test_a_reset_without_a_fault_sends_no_write(line: Line) -> None:
+def test_reset_fault_sends_no_write_without_a_fault(line: Line) -> None:
     line.drive.reset_fault()
     assert line.writes == []
 
 
-def test_fault_that_remains_after_a_reset_is_reported(line: Line, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_fault_reset_raises_if_the_fault_remains(line: Line, monkeypatch: pytest.MonkeyPatch) -> None:
     line.sim.trip(FAULT)
     monkeypatch.setattr(line.sim.motor, "reset", lambda: None)
     with pytest.raises(NotVerified, match="the fault remains"):
@@ -197,7 +197,7 @@ def test_a_start_is_refused_while_the_keypad_is_in_control(model: str) -> None:
 NO_DIRECTION = ("abb-acs355", "siemens-v20", "optidrive-e3")
 
 
-def test_direction_of_a_start_is_sent_or_refused(line: Line, model: str) -> None:
+def test_a_reverse_start_turns_the_motor_backward_or_is_refused(line: Line, model: str) -> None:
     line.drive.set_frequency(20)
     if model in NO_DIRECTION:
         with pytest.raises(WriteForbidden, match="direction"):
@@ -219,7 +219,7 @@ def test_direction_of_a_start_is_sent_or_refused(line: Line, model: str) -> None
     assert line.drive.state().condition is Condition.RUNNING
 
 
-def test_a_plain_write_of_a_start_word_is_refused(line: Line) -> None:
+def test_writing_a_start_word_to_the_control_register_is_refused(line: Line) -> None:
     control = line.drive.control
     requests = {count: Message(1, 6, control.address, data=count.to_bytes(2)) for count in range(0x900)}
     starts = [count for count, request in requests.items() if line.is_start(request)]
@@ -230,7 +230,7 @@ def test_a_plain_write_of_a_start_word_is_refused(line: Line) -> None:
     assert line.writes == []
 
 
-def test_write_of_a_raw_count_declared_harmless_never_starts_the_motor(line: Line) -> None:
+def test_control_words_declared_harmless_never_start_the_motor(line: Line) -> None:
     line.drive.set_frequency(20)
     control = line.drive.control
     for before in control.harmless:
@@ -257,7 +257,7 @@ def test_a_ramp_continues_from_the_setpoint_in_force(line: Line) -> None:
     assert line.sim.motor.target == pytest.approx(22, abs=0.01)
 
 
-def test_a_jog_that_continues_after_a_stop_is_ended_by_stop_jog() -> None:
+def test_a_stop_also_ends_a_jog_that_ignores_the_stop_word() -> None:
     line = Line("invt-goodrive")
     line.sim.jog_needs_own_stop = True
     line.drive.option["stop_time"] = 3.0
@@ -293,7 +293,7 @@ def test_the_command_stop_jog_is_sent_after_an_unconfirmed_stop(is_refused: bool
     assert not line.sim.motor.energised
 
 
-def test_the_command_stop_jog_is_not_sent_to_other_makes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stop_jog_is_not_sent_to_a_drive_of_another_family(monkeypatch: pytest.MonkeyPatch) -> None:
     line = Line("invt-goodrive")
     checked: list[Drive] = []
 
@@ -308,7 +308,7 @@ def test_the_command_stop_jog_is_not_sent_to_other_makes(monkeypatch: pytest.Mon
     assert line.writes == []
 
 
-def test_a_start_of_a_cia402_drive_without_mains_is_refused() -> None:
+def test_a_cia402_start_without_mains_raises_not_verified() -> None:
     line = Line("schneider-atv320")
     line.drive.set_frequency(20)
     line.sim.stays_off = True
@@ -330,7 +330,7 @@ def test_a_profidrive_start_during_off2_or_off3_is_refused(name: str) -> None:
     assert line.sim.motor.energised
 
 
-def test_a_coast_command_during_a_run_is_not_overridden() -> None:
+def test_a_coast_word_stops_a_running_siemens_v20() -> None:
     line = Line("siemens-v20")
     line.runs()
     line.drive.write(line.drive.control, line.drive.control.decode(0x047C))
@@ -374,7 +374,7 @@ OF_ANOTHER = {
 
 @table("first", OF_ANOTHER)
 @table("second", OF_ANOTHER)
-def test_a_stop_is_refused_only_if_two_values_show_another_make(first: str, second: str) -> None:
+def test_a_stop_is_refused_only_if_two_registers_show_another_family(first: str, second: str) -> None:
     """One make's stop word may run another make's motor. One value, or two settings, prove nothing."""
     line = Line("abb-acs355")
     shown = {line.drive.register(name).address: OF_ANOTHER[name] for name in (first, second)}
@@ -395,7 +395,7 @@ def test_a_stop_is_refused_only_if_two_values_show_another_make(first: str, seco
         assert line.writes == []
 
 
-def test_a_stop_of_an_identified_drive_is_always_sent() -> None:
+def test_an_identified_drive_is_stopped_although_the_device_code_changes() -> None:
     line = Line("invt-goodrive")
     line.runs()
     line.sim["device"] = 0

@@ -45,7 +45,7 @@ def test_every_profile_is_documented(profile: type[Drive]) -> None:
 
 
 @every_profile
-def test_a_stop_word_is_harmless_and_a_reset_word_is_not(profile: Any) -> None:
+def test_each_profile_declares_the_stop_word_harmless(profile: Any) -> None:
     harmless = profile.roles["control"].harmless
     assert profile.stop_word in harmless
     assert profile.coast_word is None or profile.coast_word in harmless
@@ -88,7 +88,7 @@ WRONG: list[tuple[type[Drive], dict[str, Any], str]] = [
 
 
 @table(("family", "registers", "mistake"), WRONG)
-def test_a_register_that_does_not_fit_its_profile_is_refused(
+def test_a_profile_refuses_unsuitable_register_declarations(
     family: type[Drive], registers: dict[str, Any], mistake: str
 ) -> None:
     with pytest.raises(DeclarationError) as wrong:
@@ -200,7 +200,7 @@ def test_identity_check_refuses_values_of_another_family(
         identify(model, **says)
 
 
-def test_drive_that_refuses_to_read_a_profile_register_is_not_identified() -> None:
+def test_the_identity_check_fails_if_the_drive_refuses_a_register() -> None:
     with pytest.raises(DriveException):
         identify("abb-acs355", signature=DriveException("abb", 2, "illegal address"))
 
@@ -504,7 +504,7 @@ def test_cia402_start_waits_for_each_state(status: list[int], words: tuple[str, 
     assert sent(found) == [ATV + word for word in words]
 
 
-def test_profidrive_drive_that_does_not_become_ready_is_switched_off() -> None:
+def test_a_profidrive_drive_is_switched_off_if_a_start_fails() -> None:
     found = wire("abb-acs355", [ABB_OFF, ABB_READY])
     with pytest.raises(NotVerified, match="not ready to operate"):
         found.drive.start()
@@ -525,7 +525,7 @@ class Clone(Goodrive):
     control = numbered(EXCHANGED)
 
 
-def test_control_words_renumbered_by_a_family_are_sent() -> None:
+def test_a_family_may_renumber_the_control_words_of_a_profile() -> None:
     drive: Any = Clone(1, confirmed=1)
     drive.commanded = 40.0
     found = Wire(drive, {**FREE, "status": drive.status.values(GD_STANDBY)})
@@ -536,7 +536,7 @@ def test_control_words_renumbered_by_a_family_are_sent() -> None:
     assert Goodrive.control.harmless == (5, 6, 8)
 
 
-def test_a_family_with_its_own_control_words_sends_its_own_stop_word() -> None:
+def test_a_running_drive_gets_the_renumbered_stop_word() -> None:
     drive: Any = Clone(1, confirmed=1)
     found = Wire(drive, {**FREE, "status": [drive.status.values(GD_RUNS), drive.status.values(GD_STANDBY)]})
     drive.stop()
@@ -570,7 +570,7 @@ def test_invalid_control_words_of_a_family_are_reported(words: Mapping[str, int]
     assert any(each.startswith(mistake) for each in wrong.value.mistakes)
 
 
-def test_a_control_register_of_whole_numbers_cannot_have_bits() -> None:
+def test_numbered_control_words_cannot_be_declared_as_bits() -> None:
     with pytest.raises(DeclarationError, match="its words are whole numbers"):
         type("Bits", (Goodrive,), {"control": command(0x2000, IntFlag("Bits", {"forward": 1, "stop": 2}))})
 

@@ -356,7 +356,7 @@ def test_every_shipped_family_is_marked_as_not_tried_on_hardware(name: str) -> N
 
 
 @every_family
-def test_every_register_of_a_family_file_names_a_page_of_a_listed_manual(name: str) -> None:
+def test_every_shipped_register_names_a_page_of_a_manual(name: str) -> None:
     family = shipped_family(name)
     words = [edition.partition(" p. ")[0].partition(", sheet")[0] for edition in EDITIONS[name]]
     assert all(word in family.manual or word in "Schneider_ATV312.yaml" for word in words)
@@ -365,7 +365,7 @@ def test_every_register_of_a_family_file_names_a_page_of_a_listed_manual(name: s
         assert any(edition in register.place for edition in EDITIONS[name]), (register.name, register.place)
 
 
-def test_family_of_the_pump_controller_has_no_commands() -> None:
+def test_the_family_erman_er_g_220_03_has_no_commands() -> None:
     family = shipped_family("erman-er-g-220-03")
     assert {register.access for register in family.registers.values()} == {Access.READING}
     assert "confirmed" not in family.options
@@ -384,7 +384,7 @@ def test_family_of_the_pump_controller_has_no_commands() -> None:
 
 
 @every_commanded_family
-def test_untested_family_sends_no_command_except_a_stop_before_confirmation(name: str) -> None:
+def test_an_untested_family_sends_only_stops_before_confirmation(name: str) -> None:
     family = shipped_family(name)
     bus, drive, _ = one(family(1))
     for call in (lambda: drive.set_frequency(20), drive.start, drive.reset_fault):
@@ -396,7 +396,7 @@ def test_untested_family_sends_no_command_except_a_stop_before_confirmation(name
 
 
 @every_profile_family
-def test_registers_that_only_identify_a_drive_are_not_polled(name: str) -> None:
+def test_identity_registers_are_not_polled(name: str) -> None:
     polled = {register.name for register in shipped_family(name).readings()}
     assert "status" in polled
     assert not polled & {"station", "signature"}
@@ -484,7 +484,7 @@ def test_unknown_profile_in_a_family_file_is_reported(tmp_path: Path) -> None:
         load(tmp_path, f'{HEAD}profile = "profdrive"\n[reading]\nspeed = {{ at = 1 }}\n')
 
 
-def test_the_delta_vfd_el_file_limits_the_registers_of_a_read() -> None:
+def test_delta_vfd_el_limits_the_number_of_registers_per_read() -> None:
     assert shipped_family("delta-vfd-el").most_registers
 
 
