@@ -41,7 +41,7 @@ def test_the_c_tests_of_the_core_pass(build: Callable[..., None]) -> None:
 
 
 @pytest.mark.slow
-def test_the_c_tests_of_rows_pass(build: Callable[..., None]) -> None:
+def test_the_c_tests_of_columns_and_packets_pass(build: Callable[..., None]) -> None:
     build("test_rows", "columns", "tap", "body", "frame")
 
 
@@ -61,13 +61,13 @@ def test_threads_can_open_and_close_ports(build: Callable[..., None], sanitizers
 
 @pytest.mark.slow
 @WAITS_BY_EPOLL
-def test_a_call_in_the_silence_after_an_exchange_does_not_wake_the_thread(build: Callable[..., None]) -> None:
+def test_core_thread_is_not_woken_by_a_call_during_silence(build: Callable[..., None]) -> None:
     build("test_wakings", *core_without("wakeup"))
 
 
 @pytest.mark.slow
 @WAITS_BY_EPOLL
-def test_the_c_thread_sleeps_while_a_caller_waits(build: Callable[..., None]) -> None:
+def test_core_thread_sleeps_while_a_caller_waits(build: Callable[..., None]) -> None:
     build("test_spinning", *core_without("clock"))
 
 
@@ -78,7 +78,7 @@ def test_a_port_is_read_once_if_reply_delays_are_constant(build: Callable[..., N
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="others have no RS-485 mode")
-def test_a_transceiver_sends_until_the_last_bit_has_left(build: Callable[..., None]) -> None:
+def test_rs485_transceiver_keeps_sending_until_the_last_bit(build: Callable[..., None]) -> None:
     build("test_rs485", "system/rs485")
 
 
@@ -105,5 +105,7 @@ def test_the_mastership_deadline_is_checked_before_each_write(build: Callable[..
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="realtime scheduling is limited by Linux's timers")
-def test_realtime_scheduling_ends_before_it_starves_the_computer(build: Callable[..., None]) -> None:
+def test_realtime_scheduling_ends_if_a_thread_uses_too_much_processor_time(
+    build: Callable[..., None],
+) -> None:
     build("test_realtime", "system/clock")

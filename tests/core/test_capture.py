@@ -58,7 +58,7 @@ def raw(spans: Iterable[FrameSpan]) -> list[tuple[Kind, bytes]]:
 
 
 @table("reply", REPLIES)
-def test_a_printed_exchange_is_split_into_a_request_and_its_reply(reply: Printed) -> None:
+def test_exchange_printed_in_a_manual_is_split_into_request_and_reply(reply: Printed) -> None:
     asked, answered = split(reply.request_frame, reply.frame)
     assert (answered.kind, answered.framing) == (Kind.REPLY, reply.framing)
     assert asked.kind in (Kind.REQUEST, Kind.EITHER)
@@ -67,7 +67,7 @@ def test_a_printed_exchange_is_split_into_a_request_and_its_reply(reply: Printed
 
 
 @given(st.lists(st.sampled_from(REPLIES), max_size=30), st.data())
-def test_the_same_frames_are_found_in_any_pieces(line: list[Printed], data: st.DataObject) -> None:
+def test_same_frames_are_found_however_the_bytes_are_cut(line: list[Printed], data: st.DataObject) -> None:
     bytes_ = READ + ANSWER + b"".join(each.request_frame + each.frame for each in line)
     stream, splitter, spans = Stream(), Splitter(), []
     at = 0
@@ -98,7 +98,7 @@ def test_a_sniffed_frame_has_the_time_of_its_first_piece() -> None:
     assert [span.time_ns for span in spans] == [0, 1, 3]
 
 
-def test_a_frame_equal_to_the_preceding_write_request_is_its_reply() -> None:
+def test_second_copy_of_a_write_request_counts_as_the_reply() -> None:
     assert kinds(split(READ, ANSWER, *[WRITE] * 6)) == [Kind.REQUEST, Kind.REPLY] * 4
 
 
@@ -119,7 +119,7 @@ def test_a_delixi_reply_is_not_mistaken_for_a_request() -> None:
     ]
 
 
-def test_a_repeated_write_request_is_a_request_if_the_master_sent_it() -> None:
+def test_repeated_write_from_the_masters_side_is_no_reply() -> None:
     stream = Stream()
     stream.put(WRITE, 0, side=Side.ANSWERING)
     stream.put(WRITE, 1, side=Side.ASKING)
@@ -131,7 +131,7 @@ def test_a_repeated_write_request_is_a_request_if_the_master_sent_it() -> None:
     assert b"".join(span.raw for span in spans) == 4 * WRITE
 
 
-def test_a_reply_after_a_damaged_request_is_not_assigned_to_the_request_before_it() -> None:
+def test_reply_after_a_damaged_request_is_not_paired_with_an_older_request() -> None:
     damaged = bytes([OTHER_READ[0] ^ 1]) + OTHER_READ[1:]
     assert kinds(split(READ, damaged, ALSO_ANSWER)) == [Kind.REQUEST, Kind.JUNK, Kind.STRAY]
 
@@ -143,7 +143,7 @@ def test_a_reply_after_a_damaged_request_is_stray() -> None:
     ]
 
 
-def test_a_reply_that_fits_no_request_does_not_end_an_exchange() -> None:
+def test_exchange_continues_after_a_reply_from_another_address() -> None:
     other = bytes.fromhex("02 83 02 30 F1")
     assert kinds(split(READ, other, ANSWER)) == [Kind.REQUEST, Kind.STRAY, Kind.REPLY]
 
@@ -161,7 +161,7 @@ def test_a_reply_is_found_after_noise() -> None:
 
 
 @pytest.mark.parametrize("first", ["", "FF"])
-def test_a_pause_ends_a_frame_that_starts_in_junk(first: str) -> None:
+def test_pause_ends_a_false_frame_start_in_junk(first: str) -> None:
     """The junk looks like the start of a long write, and the next frames look like the rest of that write."""
     junk = bytes.fromhex(first + "01 10 00 00 00 7B F6")
     stream, splitter = Stream(), Splitter()
@@ -209,7 +209,7 @@ def damaged(frame: bytes, chance: random.Random) -> bytes:
 
 @pytest.mark.long
 @table("seed", range(5))
-def test_every_exchange_that_is_not_next_to_damage_is_found(seed: int) -> None:
+def test_all_exchanges_are_found_except_next_to_damaged_frames(seed: int) -> None:
     chance = random.Random(seed)
     line = chance.choices(REPLIES, k=2000)
     sent = [frame for each in line for frame in (each.request_frame, each.frame)]

@@ -143,7 +143,7 @@ def reply(*values: int) -> Any:
     return completed(request, build_reply(Framing.RTU, Message(1, 0x03, data=words(*values))))
 
 
-def test_a_reply_gives_one_row_for_each_register_of_its_block() -> None:
+def test_reply_gives_one_row_for_each_requested_register() -> None:
     block = RowLayout(
         5,
         [
@@ -195,14 +195,14 @@ def test_a_missing_value_has_a_row_with_the_reason_as_status(received: bytes, st
     assert (columns.array("time")[0], columns.array("uncertainty")[0]) == (UTC + 1000 * MS, 0)
 
 
-def test_a_value_that_was_due_but_not_requested_has_a_row() -> None:
+def test_row_is_added_for_a_due_value_that_was_not_requested() -> None:
     columns = Columns(2)
     assert add_miss(columns, ONE, Status.NOT_ASKED, 77 * MS, UTC)
     assert (columns.array("status")[0], columns.array("sent")[0]) == (Status.NOT_ASKED, 77 * MS)
     assert columns.array("valid")[0] & 1 == 0
 
 
-def test_the_row_of_an_unsent_request_has_the_time_at_which_its_turn_came() -> None:
+def test_row_of_an_unsent_request_has_the_time_of_its_turn() -> None:
     line = LineDriver()
     line.now = 5000 * MS
     line.begin(
@@ -222,7 +222,7 @@ def test_the_row_of_an_unsent_request_has_the_time_at_which_its_turn_came() -> N
     assert (columns.array("time")[0], columns.array("status")[0]) == (UTC + 5000 * MS, Status.LINE_LOST)
 
 
-def test_a_register_beyond_the_end_of_the_reply_has_a_row_without_value() -> None:
+def test_row_has_no_value_if_the_reply_is_too_short_for_the_register() -> None:
     columns = Columns(2)
     block = RowLayout(1, [Field(0, NumberFormat.U16, 2, 1, 1), Field(1, NumberFormat.U16, 3, 1, 1)])
     assert add_rows(columns, block, reply(9), 0)
@@ -240,7 +240,7 @@ def test_the_bitmap_marks_rows_with_a_value() -> None:
     assert [valid[at // 8] >> at % 8 & 1 for at in range(20)] == pattern
 
 
-def test_a_reply_whose_rows_do_not_fit_into_the_columns_adds_no_row() -> None:
+def test_reply_adds_no_row_if_the_columns_cannot_hold_all_rows() -> None:
     columns = Columns(3)
     two = RowLayout(1, [Field(0, NumberFormat.U16, 2, 1, 1), Field(1, NumberFormat.U16, 3, 1, 1)])
     answer = reply(1, 2)
@@ -277,19 +277,19 @@ def test_an_empty_list_of_codes_gives_an_empty_column() -> None:
 BLOCK = RowLayout(0, [Field(0, NumberFormat.U16, register, 1.0, 1.0) for register in range(3)])
 
 
-def test_a_missed_block_without_registers_adds_no_row() -> None:
+def test_missed_read_of_no_registers_adds_no_row() -> None:
     row_queue = RowQueue()
     row_queue.add_miss(RowLayout(0, []), Status.NOT_ASKED, 5)
     assert (row_queue.chunks, row_queue.dropped, row_queue.take()) == (0, 0, None)
 
 
-def test_rows_of_a_block_larger_than_a_chunk_are_counted_as_dropped() -> None:
+def test_rows_are_counted_as_dropped_if_a_chunk_cannot_hold_them() -> None:
     row_queue = RowQueue(chunk_rows=2)
     row_queue.add_miss(BLOCK, Status.NOT_ASKED, 5)
     assert row_queue.dropped == 3
 
 
-def test_the_row_queue_frees_chunks_of_memory_that_it_does_not_keep_for_reuse() -> None:
+def test_row_queue_frees_returned_memory_beyond_its_reserve() -> None:
     """The reader returns more chunks than the queue keeps."""
     row_queue = RowQueue(chunk_rows=3, most_chunks=100)
     for turn in (1, 2):
@@ -316,7 +316,7 @@ def as_float32(bits: int) -> Fraction:
 
 
 @given(st.lists(st.one_of(st.integers(-(2**63), 2**63 - 1), st.sampled_from(EDGES)), max_size=9))
-def test_a_bound_is_rounded_up_to_the_next_float(numbers: list[int]) -> None:
+def test_integer_is_rounded_up_to_the_next_float32(numbers: list[int]) -> None:
     """In IEEE 754, the bits of the next float are those of the float plus one, as an integer."""
     narrow = bytes(narrow_up(memoryview(array("q", numbers))))
     for number, bits in zip(numbers, struct.unpack(f"<{len(numbers)}I", narrow), strict=True):
@@ -373,7 +373,9 @@ def test_the_greatest_code_of_a_column_is_found(given_codes: list[int]) -> None:
 
 
 @given(st.lists(st.tuples(codes, codes) | st.just((7, 65535))), st.frozensets(st.tuples(codes, codes)))
-def test_rows_are_found_by_code(rows: list[tuple[int, int]], others: frozenset[tuple[int, int]]) -> None:
+def test_rows_are_found_by_drive_and_register_codes(
+    rows: list[tuple[int, int]], others: frozenset[tuple[int, int]]
+) -> None:
     wanted = frozenset({(7, 65535), *rows[::3], *others})
     drives, registers = (memoryview(array("H", [row[side] for row in rows])) for side in (0, 1))
     assert find_codes(drives, registers, wanted) == [at for at, row in enumerate(rows) if row in wanted]
@@ -421,7 +423,7 @@ def test_structs_created_one_after_another_are_adjacent_in_memory() -> None:
 
 
 @pytest.mark.usefixtures("_new_chunk")
-def test_a_struct_lives_as_long_as_its_owner() -> None:
+def test_memory_of_a_struct_is_not_reused_while_it_is_referenced() -> None:
     made = [new_drive(number) for number in range(100)]
     kept = made[::7]
     del made
@@ -433,7 +435,7 @@ def test_a_struct_lives_as_long_as_its_owner() -> None:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_new_chunk")
-def test_threads_get_separate_memory() -> None:
+def test_structs_created_in_different_threads_do_not_overlap() -> None:
     with ThreadPoolExecutor(8) as threads:
         made = list(threads.map(new_drive, range(4000)))
     places = sorted(map(place, made))
@@ -442,7 +444,7 @@ def test_threads_get_separate_memory() -> None:
 
 
 @pytest.mark.usefixtures("_new_chunk")
-def test_a_signal_handler_gets_separate_memory() -> None:
+def test_struct_created_in_a_signal_handler_has_separate_memory() -> None:
     """The handler may stop a motor while the interrupted code allocates memory."""
     before = new_drive(1)
     with core_columns._chunks._lock:
@@ -475,7 +477,7 @@ def test_the_fields_used_by_every_exchange_are_in_five_cache_lines() -> None:
 
 
 @pytest.mark.usefixtures("_new_chunk")
-def test_polled_exchanges_of_a_drive_are_adjacent() -> None:
+def test_polled_exchanges_of_a_drive_are_adjacent_in_memory() -> None:
     """Exchanges that are not polled may be anywhere in memory."""
     peer = Peer(least_timeout=0.02, most_timeout=1.0)
     peer.prove_by([read_of(peer, None), read_of(peer, None)])

@@ -230,8 +230,8 @@ def test_no_queued_request_is_sent_before_its_time(port: Port, rows: Rows) -> No
     assert all(at >= wanted for at, wanted in zip(sent, due, strict=True))
 
 
-def test_all_missed_time_slots_of_an_exchange_are_skipped_except_the_last(drive: Drive) -> None:
-    """The last slot that is due is used, however late it is."""
+def test_only_the_last_of_several_missed_polls_is_sent(drive: Drive) -> None:
+    """The last poll that is due is sent, however late."""
     second = 1_000_000_000
     fast, slow, in_turn = read(1, period=1.0), read(2, period=30.0), read(3)
     with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
@@ -244,7 +244,7 @@ def test_all_missed_time_slots_of_an_exchange_are_skipped_except_the_last(drive:
     assert fast.peer.counters().missed == {Status.EXPIRED: 2}
 
 
-def test_a_late_request_is_sent_if_the_next_time_slot_is_not_due_yet(port: Port) -> None:
+def test_late_poll_is_sent_if_the_next_poll_is_not_due_yet(port: Port) -> None:
     rows, now = Rows(port), now_ns()
     poll = read(1, period=1.0)
     port.submit([poll, poll], [now - 5_000_000_000, now + 60_000_000_000])
@@ -263,7 +263,7 @@ def test_repeated_exchanges_are_sent_until_they_are_replaced(port: Port, rows: R
     assert status_of(port.carry_out(read(9))) == 0
 
 
-def test_the_next_exchange_is_reported_when_repeated_exchanges_are_replaced(port: Port, rows: Rows) -> None:
+def test_replacing_repeated_exchanges_returns_which_one_was_next(port: Port, rows: Rows) -> None:
     port.repeat([read(0), read(1), read(2)])
     rows.of("value", 20)
     following = port.repeat([])
@@ -285,7 +285,7 @@ def test_queued_exchanges_are_carried_out_between_repeated_exchanges(port: Port,
     assert sent[at] >= due_ns
 
 
-def test_repetition_ends_at_an_exchange_that_cannot_be_sent(drive: Drive) -> None:
+def test_repeated_exchanges_end_if_one_cannot_be_sent(drive: Drive) -> None:
     slow = Peer(least_timeout=0.01, most_timeout=0.02)
     with closing(Port(drive(lambda _: b""), NO_SETTINGS)) as port:
         assert port.carry_out(read(1, peer=slow)).result == Failure.NO_REPLY
@@ -316,7 +316,7 @@ def test_a_waiting_client_wakes_when_a_drive_fails_or_recovers(drive: Drive) -> 
             assert row_queue.await_calls(60) == [17]
 
 
-def test_a_waiting_client_wakes_on_a_refusal_or_a_lost_port() -> None:
+def test_waiting_client_wakes_on_an_exception_reply_or_a_lost_port() -> None:
     with opened() as (port, far):
         row_queue = RowQueue()
         port.report_to(row_queue, 3)
@@ -341,7 +341,7 @@ def test_rows_dropped_from_a_full_queue_are_counted(port: Port) -> None:
     assert [each for columns in kept for each in columns.array("value")] == [*range(10), *range(30, 35)]
 
 
-def test_a_memoryview_of_rows_outlives_the_object_that_made_it(port: Port) -> None:
+def test_memoryview_of_rows_stays_valid_after_its_columns_are_deleted(port: Port) -> None:
     row_queue = RowQueue()
     port.report_to(row_queue, 0)
     queued = [read(start) for start in range(100)]
@@ -355,7 +355,7 @@ def test_a_memoryview_of_rows_outlives_the_object_that_made_it(port: Port) -> No
     assert list(values) == list(range(100))
 
 
-def test_columns_of_rows_outlive_their_queue(drive: Drive) -> None:
+def test_columns_stay_valid_after_the_row_queue_is_freed(drive: Drive) -> None:
     with closing(Port(drive(echo_start), NO_SETTINGS)) as port:
         row_queue = RowQueue()
         port.report_to(row_queue, 0)
@@ -407,7 +407,7 @@ def test_an_inconclusive_echo_probe_is_repeated(drive: Drive) -> None:
 
 
 @pytest.mark.parametrize("echo", [Echo.ON, Echo.OFF])
-def test_a_configured_echo_needs_no_probe(drive: Drive, echo: Echo) -> None:
+def test_no_echo_probe_is_sent_if_the_echo_option_is_set(drive: Drive, echo: Echo) -> None:
     requested: list[int] = []
     with closing(Port(drive(noting(requested)), NO_SETTINGS)) as port:
         port.set_echo(echo)
@@ -437,7 +437,7 @@ def test_the_result_of_an_exchange_has_the_values_of_its_reply(drive: Drive) -> 
         assert again.numbers[1] != again.numbers[1]
 
 
-def test_result_memory_that_is_too_small_for_the_values_is_not_reused(port: Port) -> None:
+def test_result_memory_is_not_reused_if_too_small_for_the_values(port: Port) -> None:
     short = Completion()
     found = port.carry_out(read(7, values=ONE_VALUE), into=short)
     assert found is not short
@@ -445,7 +445,7 @@ def test_result_memory_that_is_too_small_for_the_values_is_not_reused(port: Port
     assert short.result == 0
 
 
-def test_an_urgent_exchange_that_has_already_expired_is_not_sent(drive: Drive) -> None:
+def test_expired_urgent_exchange_is_not_sent(drive: Drive) -> None:
     requested: list[int] = []
     with closing(Port(drive(noting(requested)), NO_SETTINGS)) as port:
         found = port.carry_out(read(3), expires_ns=boottime_ns() - 1)
@@ -471,7 +471,7 @@ def written(
     )
 
 
-def test_an_urgent_exchange_that_expires_while_it_waits_is_not_sent(drive: Drive) -> None:
+def test_urgent_exchange_is_not_sent_after_expiring_in_the_queue(drive: Drive) -> None:
     fd = drive(lambda request: echo_start(request) if request.address else b"")
     with closing(Port(fd, NO_SETTINGS)) as port:
         assert port.carry_out(written(0, 1, turnaround=0.3)).result == 0
@@ -479,7 +479,7 @@ def test_an_urgent_exchange_that_expires_while_it_waits_is_not_sent(drive: Drive
         assert (found.result, found.sent_ns) == (Failure.EXPIRED, 0)
 
 
-def test_a_stop_precedes_waiting_requests_and_cancels_earlier_ones_of_its_drive(drive: Drive) -> None:
+def test_stop_overtakes_waiting_requests_and_cancels_earlier_starts(drive: Drive) -> None:
     """An earlier start of the drive must be sent neither after the stop, nor before it."""
     latch, other = Latch(), Latch()
     requested: list[int] = []
@@ -516,7 +516,7 @@ def test_a_stop_precedes_waiting_requests_and_cancels_earlier_ones_of_its_drive(
     assert (found[50].result, found[50].sent_ns) == (Failure.EXPIRED, 0)
 
 
-def test_a_stop_waits_for_the_timeout_of_only_one_silent_drive_that_is_being_stopped(drive: Drive) -> None:
+def test_stops_of_silent_and_answering_drives_take_turns(drive: Drive) -> None:
     """After each timeout, a stop of a drive that answers goes first; then a silent drive has its turn."""
     requested: list[int] = []
     go_on = threading.Event()
@@ -544,7 +544,7 @@ def test_a_stop_waits_for_the_timeout_of_only_one_silent_drive_that_is_being_sto
     assert requested == [0, 50, 10, 51, 11, 52]
 
 
-def test_a_write_permit_issued_before_or_during_a_stop_is_never_valid_again() -> None:
+def test_write_permit_from_before_or_during_a_stop_stays_invalid() -> None:
     latch = Latch()
     before = latch.permit()
     assert before.is_good
@@ -559,7 +559,7 @@ def test_a_write_permit_issued_before_or_during_a_stop_is_never_valid_again() ->
     assert not latch.permit().is_good
 
 
-def test_no_write_permit_is_valid_while_one_of_several_stops_is_in_progress() -> None:
+def test_write_permits_are_invalid_until_the_last_of_several_stops_ends() -> None:
     latch = Latch()
     latch.hold(1, "a stop")
     latch.hold(2, "another stop")
@@ -569,7 +569,7 @@ def test_no_write_permit_is_valid_while_one_of_several_stops_is_in_progress() ->
     assert latch.permit().is_good
 
 
-def test_the_write_permit_of_a_call_that_began_before_a_stop_is_invalid() -> None:
+def test_write_permit_is_invalid_if_the_call_began_before_a_stop() -> None:
     latch = Latch()
     seen = latch.c[0]
     assert latch.permit(seen).is_good
@@ -607,7 +607,7 @@ def test_closing_a_port_reports_whether_each_pending_request_was_sent(drive: Dri
     assert sorted(each.sent_ns > 0 for each in found) == [False, True]
 
 
-def test_each_exchange_that_is_counted_before_a_port_closes_has_a_row() -> None:
+def test_every_counted_exchange_has_a_row_after_the_port_closes() -> None:
     """The port is closed at the moment when a reply comes."""
     values = 0
     for _ in range(60):
@@ -637,7 +637,7 @@ def wait_until_it_sleeps(thread: threading.Thread) -> None:
 
 
 @pytest.mark.parametrize("insists", [False, True], ids=["reads", "stops"])
-def test_polling_keeps_a_share_of_the_line_except_during_stops(drive: Drive, insists: bool) -> None:
+def test_polling_continues_between_urgent_exchanges_except_during_stops(drive: Drive, insists: bool) -> None:
     """Between urgent exchanges, polling gets one exchange at a time, and never two in a row."""
     asked: list[str] = []
     go_on = threading.Event()
@@ -673,7 +673,7 @@ def test_a_port_is_served_on_time_after_another_port_was_closed(drive: Drive) ->
         until(lambda: not pending(port))
 
 
-def test_queued_exchanges_are_kept_alive_until_they_end(port: Port, rows: Rows) -> None:
+def test_queued_exchanges_are_not_garbage_collected_before_they_end(port: Port, rows: Rows) -> None:
     port.submit([read(1), read(2)], [now_ns() + 20_000_000] * 2)
     gc.collect()
     assert rows.of("value", 2) == [1, 2]
@@ -746,7 +746,7 @@ def test_exchanges_queued_on_a_lost_port_stay_queued() -> None:
 
 @table("way", ["queued", "repeated"])
 @table("answered", [0, 1])
-def test_cut_off_is_true_only_if_the_port_is_lost_after_a_reply(answered: int, way: str) -> None:
+def test_cut_off_tells_whether_replies_came_before_the_port_was_lost(answered: int, way: str) -> None:
     with opened() as (port, far):
         todo = [read(0), read(1), read(2)]
         port.submit(todo, [0] * 3) if way == "queued" else port.repeat(todo)
@@ -764,7 +764,7 @@ def test_cut_off_is_true_only_if_the_port_is_lost_after_a_reply(answered: int, w
             assert port.repeat([]) == 1  # index of the exchange that comes next: the one without a reply
 
 
-def test_a_pty_whose_far_end_hangs_up_is_lost() -> None:
+def test_port_is_lost_if_the_far_end_of_a_pty_hangs_up() -> None:
     master, slave = os.openpty()
     os.set_blocking(slave, False)
     with closing(Port(slave, ANY_SETTINGS)) as port:
@@ -793,7 +793,7 @@ def test_no_request_is_sent_if_the_port_refuses_its_settings() -> None:
     os.close(master)
 
 
-def test_the_time_of_a_settings_change_is_measured() -> None:
+def test_duration_of_a_settings_change_is_measured() -> None:
     master, slave = os.openpty()
     os.set_blocking(slave, False)
     with closing(Port(slave, ANY_SETTINGS)) as port:
@@ -806,7 +806,7 @@ def test_the_time_of_a_settings_change_is_measured() -> None:
     os.close(master)
 
 
-def test_a_port_without_serial_settings_is_lost_if_they_are_required(drive: Drive) -> None:
+def test_port_is_lost_if_the_descriptor_has_no_serial_settings(drive: Drive) -> None:
     with closing(Port(drive(echo_start), ANY_SETTINGS)) as port:
         found = port.carry_out(read(0))
         assert (found.result, found.error) == (Failure.LINE_LOST, errno.ENOTTY)
@@ -817,7 +817,7 @@ def test_an_invalid_descriptor_raises() -> None:
         Port(-1, NO_SETTINGS)
 
 
-def test_closing_a_port_wakes_the_threads_that_wait_for_it(drive: Drive) -> None:
+def test_closing_a_port_wakes_the_threads_that_wait_for_replies(drive: Drive) -> None:
     requested = threading.Event()
 
     def answer(_: Message) -> bytes:
@@ -834,7 +834,7 @@ def test_closing_a_port_wakes_the_threads_that_wait_for_it(drive: Drive) -> None
     assert found == [Failure.LINE_LOST]
 
 
-def test_a_drive_counts_as_asked_while_an_exchange_with_it_is_pending() -> None:
+def test_is_asking_is_true_while_the_drive_has_pending_exchanges() -> None:
     """`is_asking` is true while a drive's exchanges wait or are in flight, but not for another drive."""
     with opened(room=4) as (port, far):
         queued, repeated, other = (read(1, timeout=0.02) for _ in range(3))

@@ -126,7 +126,7 @@ def any_port(request: pytest.FixtureRequest) -> Iterator[str]:
 
 
 @pytest.mark.slow
-def test_a_child_opens_lines_of_its_own(port: str) -> None:
+def test_forked_child_can_open_other_lines(port: str) -> None:
     def open_another() -> float:
         with Bus(other.wires[0].path) as bus:
             return current(bus)
@@ -139,7 +139,7 @@ def test_a_child_opens_lines_of_its_own(port: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_child_of_a_child_opens_lines_of_its_own(port: str) -> None:
+def test_forked_grandchild_can_open_other_lines(port: str) -> None:
     def open_it() -> float:
         with Bus(port) as bus:
             return current(bus)
@@ -155,7 +155,7 @@ def test_a_child_of_a_child_opens_lines_of_its_own(port: str) -> None:
 
 
 @pytest.mark.slow
-def test_an_inherited_bus_raises_that_it_was_opened_before_the_fork(any_port: str) -> None:
+def test_using_an_inherited_bus_in_a_forked_child_raises_an_error(any_port: str) -> None:
     def use() -> list[str]:
         with bus:
             stopped = [each.why for each in bus.stop_all().values()]
@@ -173,7 +173,7 @@ def test_an_inherited_bus_raises_that_it_was_opened_before_the_fork(any_port: st
 
 
 @pytest.mark.slow
-def test_a_child_that_discards_an_inherited_bus_does_not_disturb_the_parent(any_port: str) -> None:
+def test_parents_bus_works_after_a_child_discards_a_copy(any_port: str) -> None:
     buses = [Bus(any_port)]
 
     def let_go() -> None:
@@ -189,14 +189,14 @@ def test_a_child_that_discards_an_inherited_bus_does_not_disturb_the_parent(any_
 
 
 @pytest.mark.slow
-def test_a_child_that_closes_an_inherited_bus_does_not_close_the_parents_port() -> None:
+def test_parents_port_stays_open_if_a_child_closes_the_inherited_bus() -> None:
     with Bus("loop://") as bus:
         assert in_child(bus.close) is None
         with pytest.raises(NoReply):
             current(bus)
 
 
-def test_a_port_that_the_parent_closed_is_free_while_the_child_lives(port: str) -> None:
+def test_parent_can_reopen_a_closed_port_while_the_child_lives(port: str) -> None:
     bus = Bus(port)
     with child(lambda: None):
         bus.close()
@@ -223,7 +223,7 @@ def test_a_child_does_not_wait_for_a_bus_lock_held_in_the_parent(port: str) -> N
 
 
 @pytest.mark.slow
-def test_a_poller_is_closed_and_empty_in_a_forked_child(port: str) -> None:
+def test_inherited_poller_is_closed_in_a_forked_child(port: str) -> None:
     def look() -> list[Any]:
         found = [poller.take(), poller.summary()["lines"].keys(), poller.fileno() > 0]
         poller.close()
@@ -256,7 +256,7 @@ def test_a_child_does_not_wait_for_a_poller_lock_held_in_the_parent(port: str) -
         until(lambda: is_polled(poller))
 
 
-def test_a_wrapped_function_does_nothing_in_a_child_process() -> None:
+def test_only_here_wrapper_does_nothing_in_a_forked_child() -> None:
     given: list[str] = []
     give_back = only_here(given.append)
 
@@ -375,7 +375,7 @@ print("and here it works:", Bus.__name__)
 
 
 @pytest.mark.slow
-def test_an_import_fails_in_a_sub_interpreter_but_not_in_the_main_one() -> None:
+def test_importing_multidrop_fails_in_a_sub_interpreter() -> None:
     done = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, check=True)
     refused = (
         "multidrop cannot be imported in a sub-interpreter. Import it in the process's main "

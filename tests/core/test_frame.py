@@ -95,7 +95,7 @@ def test_a_reply_is_built_as_documented() -> None:
         assert build_reply(printed.framing, printed.says) == printed.frame
 
 
-def test_function_89h_is_accepted_for_88h_but_never_sent() -> None:
+def test_misprinted_function_89h_is_accepted_but_never_sent() -> None:
     refusal = Message(1, 0x08, exception=1)
     request = Message(1, 0x08, 0, data=words(0xA537))
     assert parse_reply(RTU, bytes.fromhex(MISPRINTED), request) == (5, refusal)
@@ -131,7 +131,7 @@ def test_a_reply_is_found_after_junk() -> None:
             assert (found.raw, found.reply) == (printed.frame, printed.says)
 
 
-def test_a_reply_is_found_after_an_incomplete_text_frame() -> None:
+def test_reply_is_found_after_an_incomplete_ascii_frame() -> None:
     found = carry_out(ASCII, WRITE_ONE, b":010600" + b":010600101234A3\r\n")
     assert (found.result, found.skipped) == (17, 7)
 
@@ -145,7 +145,7 @@ def test_reply_length_returns_the_length_of_a_good_reply() -> None:
 
 
 @table(("framing", "finish"), [(RTU, checksums.rtu), (ASCII, checksums.ascii)])
-def test_the_longest_reply_is_read(framing: Framing, finish: Callable[[str], bytes]) -> None:
+def test_longest_possible_reply_is_parsed(framing: Framing, finish: Callable[[str], bytes]) -> None:
     data = bytes(range(250))
     frame = finish(f"0103FA{data.hex().upper()}")
     used, reply = parse_reply(framing, frame, Message(1, 0x03, 0, 125))
@@ -229,7 +229,7 @@ def test_the_result_of_a_wrong_reply_has_a_fault_and_no_data(
         assert found.reply == Message(0, 0)
 
 
-def test_a_stray_zero_before_each_reply_loses_no_value() -> None:
+def test_values_are_read_despite_a_stray_zero_before_each_reply() -> None:
     line = LineDriver()
     for value in range(30):
         line.send(exchange(RTU, READ_TWO))
@@ -246,7 +246,7 @@ def test_refusal_codes_of_the_delixi_protocol_are_returned_as_exceptions(code: i
     assert parse_request(DELIXI, frame) == (FrameFault.BAD_FUNCTION, None)  # only drives send a refusal
 
 
-def test_delixis_state_is_read_from_the_parameter_field_of_the_reply() -> None:
+def test_state_of_a_delixi_drive_is_read_from_the_parameter_field() -> None:
     used, reply = parse_reply(DELIXI, b":010300020000000006\r\n", ASK_STATE)
     assert (used, reply) == (21, Message(1, 3, 2, data=words(0, 2)))
 
@@ -263,7 +263,7 @@ IDENTITY = b"\x0e\x01\x01\x00\x00\x02\x00\x03ABB\x01\x02X1"  # two objects: make
         (0x2B, b"\x0e\x01\x00", "01 2B 0E 01 00", IDENTITY, f"01 2B {IDENTITY.hex()}"),
     ],
 )
-def test_a_read_without_addresses_is_built_and_its_reply_parsed(
+def test_read_functions_without_register_addresses_are_supported(
     function: int, asked: bytes, request: str, data: bytes, reply: str
 ) -> None:
     message = Message(1, function, data=asked)
@@ -275,7 +275,7 @@ def test_a_read_without_addresses_is_built_and_its_reply_parsed(
         assert parse_reply(RTU, rtu(reply)[:length], message) == (FrameFault.INCOMPLETE, None)
 
 
-def test_an_identification_of_another_kind_or_length_is_not_accepted_as_reply() -> None:
+def test_identification_reply_with_wrong_code_or_length_is_refused() -> None:
     message = Message(1, 0x2B, data=b"\x0e\x01\x00")
     other_code = bytes([*IDENTITY[:1], 2, *IDENTITY[2:]])
     assert parse_reply(RTU, rtu(f"01 2B {other_code.hex()}"), message) == (FrameFault.BAD_ECHO, None)
@@ -360,7 +360,7 @@ def test_a_request_with_251_data_bytes_raises() -> None:
 
 
 @table("count", [0, 126, 127, 128, 0xFFFF])
-def test_only_an_exception_fits_a_sniffed_request_with_an_impossible_count(count: int) -> None:
+def test_request_with_an_impossible_count_accepts_only_an_exception_reply(count: int) -> None:
     """A sniffed master may request any count, and an exception is a reply to that request too."""
     request = Message(1, 0x03, 0, count)
     data_len = 2 * count & 0xFF

@@ -87,7 +87,9 @@ def test_the_port_is_first_read_shortly_before_the_replys_end(line: LineDriver, 
         assert looks(line, drive, 15 * MS)[1] == looks(line, drive, 16 * MS)[1] == 0
 
 
-def test_the_wait_for_the_rest_of_a_reply_depends_on_its_length(line: LineDriver, drive: Peer) -> None:
+def test_wait_for_the_rest_of_a_reply_depends_on_the_missing_characters(
+    line: LineDriver, drive: Peer
+) -> None:
     ask(line, drive)
     line.now += 60 * MS
     line.receive(reply()[:3])
@@ -155,7 +157,7 @@ def test_a_silent_drive_gets_the_longest_timeout_once_and_then_rarely(line: Line
     assert drive.failures == 0
 
 
-def test_a_write_waits_at_least_its_own_timeout_for_its_reply(line: LineDriver, drive: Peer) -> None:
+def test_learnt_timeout_does_not_shorten_the_timeout_of_a_write(line: LineDriver, drive: Peer) -> None:
     """Its timeout does not shrink with that of reads, because an unconfirmed write is worse than waiting."""
     for _ in range(12):
         answer(line, drive, 2 * MS)
@@ -182,14 +184,14 @@ def gathered(line: LineDriver, drive: Peer, request: Message = READ) -> None:
 
 
 @pytest.mark.parametrize("asked", [READ, LONG], ids=["short", "long"])
-def test_the_wait_for_a_missing_reply_does_not_depend_on_its_length(
+def test_timeout_of_a_missing_reply_ignores_the_expected_length(
     line: LineDriver, drive: Peer, asked: Message
 ) -> None:
     answer(line, drive, 2 * MS)
     assert given_up(line, drive, asked) == LEAST + AWAITED
 
 
-def test_the_line_waits_for_the_end_of_a_reply_that_has_started(line: LineDriver, drive: Peer) -> None:
+def test_line_waits_for_the_rest_of_a_started_reply(line: LineDriver, drive: Peer) -> None:
     answer(line, drive, 2 * MS)
     left = ask(line, drive, LONG)
     text = build_reply(Framing.RTU, Message(1, 3, data=bytes(200)))
@@ -218,7 +220,7 @@ def test_an_echo_does_not_count_as_the_start_of_a_reply(line: LineDriver, drive:
 
 
 @pytest.mark.parametrize("asked", [READ, LONG], ids=["short", "long"])
-def test_the_wait_includes_the_replys_length_if_the_adapter_delivers_whole_replies(
+def test_timeout_includes_the_reply_length_if_replies_arrive_whole(
     line: LineDriver, drive: Peer, asked: Message
 ) -> None:
     """Such an adapter delivers no byte before the end of the reply."""
@@ -227,7 +229,7 @@ def test_the_wait_includes_the_replys_length_if_the_adapter_delivers_whole_repli
     assert given_up(line, drive, LONG) >= LEAST + 205 * CHARACTER
 
 
-def test_noise_is_not_taken_for_an_adapter_that_sends_bytes_one_by_one(line: LineDriver, drive: Peer) -> None:
+def test_noise_is_not_mistaken_for_byte_by_byte_delivery(line: LineDriver, drive: Peer) -> None:
     ask(line, drive)
     line.receive(b"\x01")
     line.receive(b"\x03\x07")
@@ -237,7 +239,7 @@ def test_noise_is_not_taken_for_an_adapter_that_sends_bytes_one_by_one(line: Lin
     assert given_up(line, drive, LONG) >= LEAST + 205 * CHARACTER
 
 
-def test_a_reply_after_a_shortened_wait_is_recognised_as_late(line: LineDriver, drive: Peer) -> None:
+def test_reply_after_a_shortened_timeout_is_recognised_as_late(line: LineDriver, drive: Peer) -> None:
     answer(line, drive, 2 * MS)
     given_up(line, drive)
     assert is_barred(line, drive, OTHER)
@@ -267,7 +269,7 @@ def test_a_late_reply_is_expected_after_a_lost_port_is_reopened(line: LineDriver
 
 
 @pytest.mark.parametrize("is_row", [True, False], ids=["for a row", "for a client"])
-def test_a_polled_value_that_may_be_late_has_the_time_of_the_first_request(
+def test_possibly_late_polled_value_has_the_time_of_the_first_request(
     line: LineDriver, drive: Peer, is_row: bool
 ) -> None:
     """A read by `Bus` gets no value yet: the C core must first be sure that no late reply is due."""
@@ -310,13 +312,13 @@ def test_only_reads_are_repeated_if_the_reply_may_be_late(drive: Peer, asked: Me
     assert drive.exchanges == times
 
 
-def test_no_late_reply_is_expected_to_an_unsent_request(line: LineDriver, drive: Peer) -> None:
+def test_no_late_reply_is_expected_if_the_request_was_not_sent(line: LineDriver, drive: Peer) -> None:
     line.begin(exchange(READ, drive))
     line.lose(0)
     assert drive.late_until_ns == 0
 
 
-def test_a_request_is_sent_if_no_late_reply_resembles_its_reply(line: LineDriver, drive: Peer) -> None:
+def test_write_does_not_wait_for_the_late_reply_to_a_read(line: LineDriver, drive: Peer) -> None:
     """A stop is a write: the late reply to a read differs from its reply."""
     time_out(line, drive)
     ask(line, drive, WRITE)
@@ -361,7 +363,7 @@ def delixi(function: int, start: int, value: int = 0) -> Message:
     ],
     ids=["another parameter", "the same one", "a state", "a state and a parameter", "a write", "a command"],
 )
-def test_a_delixi_request_waits_for_a_late_reply_that_resembles_its_reply(
+def test_delixi_request_waits_for_a_late_reply_that_looks_alike(
     line: LineDriver, drive: Peer, first: Message, second: Message
 ) -> None:
     line.send(exchange(first, drive, Framing.DELIXI))
@@ -388,7 +390,7 @@ def test_a_stop_does_not_wait_for_late_replies(line: LineDriver, drive: Peer) ->
     assert line.send(stop) == build_request(Framing.RTU, WRITE)
 
 
-def test_the_timeout_of_a_stop_doubles_from_its_second_failure_on(line: LineDriver, drive: Peer) -> None:
+def test_stop_timeout_doubles_from_the_second_failure_on(line: LineDriver, drive: Peer) -> None:
     """A stop must be repeated before the longest documented timeout has passed.
 
     The first failure is that of the read before the stop. It does not double the timeout, because other
@@ -405,7 +407,7 @@ def test_the_timeout_of_a_stop_doubles_from_its_second_failure_on(line: LineDriv
     assert found == [60, 60, 120, 240, 300]
 
 
-def test_bytes_like_a_damaged_reply_inside_another_frame_are_ignored(line: LineDriver, drive: Peer) -> None:
+def test_late_reply_is_still_expected_after_bytes_like_a_damaged_reply(line: LineDriver, drive: Peer) -> None:
     ask(line, drive)
     inside = bytes([1, 3, 2, 0, 0, 0, 0])  # looks like a reply with a wrong checksum
     line.receive(build_reply(Framing.RTU, Message(1, 4, data=bytes(1) + inside)))
@@ -429,7 +431,7 @@ def test_no_late_reply_is_expected_after_the_longest_documented_delay(line: Line
 
 
 @pytest.mark.parametrize("piece", [7, 1], ids=["whole", "byte by byte"])
-def test_a_late_reply_is_recognised_and_ends_the_wait(line: LineDriver, drive: Peer, piece: int) -> None:
+def test_next_request_is_sent_once_the_late_reply_has_come(line: LineDriver, drive: Peer, piece: int) -> None:
     time_out(line, drive)
     line.receive(reply(1111), piece)
     assert drive.late_until_ns == 0
@@ -510,7 +512,7 @@ def test_a_reply_is_accepted_although_its_data_look_like_a_late_reply(line: Line
     assert (drive.counters().late, drive.late_until_ns) == (0, until)
 
 
-def test_a_frame_of_a_drive_without_outstanding_requests_is_stray(line: LineDriver, drive: Peer) -> None:
+def test_frame_from_a_drive_without_open_requests_is_not_a_late_reply(line: LineDriver, drive: Peer) -> None:
     time_out(line, drive)
     line.now = drive.late_until_ns
     ask(line, peer(), Message(2, 3, 0, 1))
@@ -552,9 +554,7 @@ def all_looks(
     return [looks(line, drive, delay, details) for delay in delays]
 
 
-def test_seven_of_eight_replies_are_read_at_once_if_delays_are_constant(
-    line: LineDriver, drive: Peer
-) -> None:
+def test_seven_of_eight_replies_need_one_read_if_delays_are_constant(line: LineDriver, drive: Peer) -> None:
     all_looks(line, drive, STEADY, FOR_A_CLIENT)
     found = all_looks(line, drive, 80 * [15 * MS], FOR_A_CLIENT)
     assert sum(times == 1 for times, _ in found) == 70

@@ -85,7 +85,7 @@ def exchanged(line: LineDriver, received: bytes, request: Message = READ, piece:
     return line.completion
 
 
-def test_the_time_of_a_value_is_never_after_its_reply(line: LineDriver) -> None:
+def test_value_time_is_never_later_than_the_reply(line: LineDriver) -> None:
     """The thread may notice late that the request was sent, because writing to the port blocked it."""
     line.begin(exchange(READ))
     while line.want != "write":
@@ -110,7 +110,7 @@ def test_a_value_from_a_pseudo_terminal_has_the_time_of_the_read(line: LineDrive
     assert (line.completion.first_ns, line.completion.last_ns) == (came, came)
 
 
-def test_the_timeout_starts_after_a_write_that_was_held_up(line: LineDriver) -> None:
+def test_timeout_starts_when_a_delayed_write_is_complete(line: LineDriver) -> None:
     line.begin(exchange(READ))
     while line.want != "write":
         line.now = max(line.now, line.wake)
@@ -153,7 +153,7 @@ def test_silence_counts_from_the_last_byte_received(line: LineDriver) -> None:
     assert line.completion.stale == 2
 
 
-def test_bytes_found_in_the_last_read_restart_the_silence(line: LineDriver) -> None:
+def test_silence_restarts_if_bytes_arrive_just_before_sending(line: LineDriver) -> None:
     line.begin(exchange(READ))
     line.now += SILENCE
     assert line.listens
@@ -162,7 +162,7 @@ def test_bytes_found_in_the_last_read_restart_the_silence(line: LineDriver) -> N
     assert line.wake == line.now + SILENCE
 
 
-def test_a_request_is_sent_after_a_timeout_even_if_the_line_is_never_silent(line: LineDriver) -> None:
+def test_request_is_sent_after_the_timeout_if_noise_never_ends(line: LineDriver) -> None:
     """The request may be a stop, and the noise may exist only in this computer's adapter."""
     opened = line.now
     line.begin(exchange(READ))
@@ -178,7 +178,7 @@ def test_a_request_is_sent_after_a_timeout_even_if_the_line_is_never_silent(line
     assert (line.completion.reply.data, line.completion.stale) == (words(7), reads)
 
 
-def test_a_request_is_sent_after_the_timeout_even_if_bytes_keep_coming(line: LineDriver) -> None:
+def test_overdue_request_is_sent_within_three_reads_of_a_flood(line: LineDriver) -> None:
     line.begin(exchange(READ))
     line.now += SILENCE + TIMEOUT
     for _ in range(3):
@@ -348,7 +348,7 @@ def test_a_reply_that_is_read_at_the_timeout_is_accepted(line: LineDriver) -> No
     assert line.data_after(reply_of(3)) == words(3)
 
 
-def test_an_exchange_ends_after_one_read_at_its_timeout(line: LineDriver) -> None:
+def test_exchange_reads_only_once_more_at_the_timeout(line: LineDriver) -> None:
     ask(line)
     assert line.listens
     line.now = line.wake
@@ -421,7 +421,7 @@ def test_a_late_reply_is_discarded_before_the_next_request(line: LineDriver) -> 
     assert (found.reply.data, found.stale, found.skipped) == (words(2222), 7, 0)
 
 
-def test_a_second_copy_of_a_reply_is_not_the_next_exchanges_reply(line: LineDriver) -> None:
+def test_repeated_reply_is_not_accepted_by_the_next_exchange(line: LineDriver) -> None:
     exchanged(line, reply_of(1111))
     line.begin(exchange(READ))
     assert line.listens
@@ -457,7 +457,7 @@ def test_few_bytes_are_kept_while_endless_garbage_arrives(line: LineDriver, rece
     assert (found.skipped, found.raw) == (len(garbage), garbage[-513:])
 
 
-def test_a_broadcast_ends_when_it_is_sent_and_the_turnaround_delay_follows(line: LineDriver) -> None:
+def test_turnaround_delay_starts_when_a_broadcast_is_sent(line: LineDriver) -> None:
     ask(line, BROADCAST)
     sent = line.now
     assert line.want == "done"
@@ -562,7 +562,7 @@ DAMAGED_ECHOES = {
 
 @pytest.mark.parametrize("piece", [4096, 1], ids=["whole", "byte by byte"])
 @pytest.mark.parametrize("echo", DAMAGED_ECHOES)
-def test_a_damaged_echo_of_a_write_confirms_nothing(line: LineDriver, echo: str, piece: int) -> None:
+def test_damaged_echo_of_a_write_is_no_confirmation(line: LineDriver, echo: str, piece: int) -> None:
     """A later copy confirms nothing either: it may be the echo, after noise. The next read succeeds."""
     teach_echo(line)
     ask(line, WRITE)
@@ -597,7 +597,7 @@ def test_write_confirmations_are_accepted_after_two_replies_without_echo(line: L
 
 
 @pytest.mark.parametrize("piece", [4096, 1], ids=["whole", "byte by byte"])
-def test_the_start_of_an_echo_is_not_a_reply(line: LineDriver, piece: int) -> None:
+def test_echo_that_starts_like_a_reply_is_skipped(line: LineDriver, piece: int) -> None:
     """The first seven of the echo's eight bytes are a good reply with one register."""
     echo = rtu("06 03 02 11 00 01")
     assert echo[:7] == rtu("06 03 02 11 00")
@@ -630,7 +630,7 @@ def test_the_configured_echo_of_a_delixi_query_is_not_taken_for_a_value(line: Li
     assert (line.completion.reply.data, line.completion.skipped) == (value, 21)
 
 
-def test_a_copy_of_a_request_is_no_reply_while_it_may_be_an_echo(line: LineDriver) -> None:
+def test_copy_of_a_write_confirms_nothing_if_it_may_be_an_echo(line: LineDriver) -> None:
     found = exchanged(line, confirmation(), WRITE)
     assert (found.result, found.raw) == (Failure.MAYBE_ECHO, confirmation())
     found = exchanged(line, confirmation() + confirmation(), WRITE)  # two copies, so the adapter echoes
@@ -645,7 +645,9 @@ def test_a_reply_without_an_echo_shows_that_the_adapter_does_not_echo(line: Line
 
 
 @pytest.mark.parametrize(("stray", "told"), [(1, True), (3, True), (4, False), (8, False)])
-def test_a_few_stray_bytes_before_a_reply_are_no_echo(line: LineDriver, stray: int, told: bool) -> None:
+def test_stray_bytes_before_a_reply_are_not_taken_for_an_echo(
+    line: LineDriver, stray: int, told: bool
+) -> None:
     """A line driver may send a zero byte before every reply: confirmations are still accepted."""
     assert exchanged(line, bytes(stray) + reply_of(1)).reply.data == words(1)
     assert (exchanged(line, bytes(stray) + confirmation(), WRITE).result == 8) is told
@@ -804,7 +806,7 @@ def test_two_copies_of_a_query_do_not_show_whether_the_adapter_echoes(line: Line
     assert line.echo == lib.MD_ECHO_UNKNOWN
 
 
-def test_a_coils_reply_that_looks_like_an_echo_is_accepted_at_the_timeout(line: LineDriver) -> None:
+def test_coils_reply_equal_to_the_request_is_accepted_at_the_timeout(line: LineDriver) -> None:
     """The reply to a read of 17 coils from address 0320H can have the same bytes as the request."""
     copy = rtu("01 01 03 20 00 11")
     exchanged(line, reply_of(1))

@@ -116,7 +116,7 @@ def test_concurrent_extensions_keep_the_latest_deadline() -> None:
     mastership.end()
 
 
-def test_a_past_deadline_raises_and_arms_no_timer() -> None:
+def test_past_mastership_deadline_raises_without_starting_the_kill_timer() -> None:
     """A kernel timer that is set to a past time would kill the process immediately."""
     mastership = Mastership(guard_s=1e-6)
     with pytest.raises(
@@ -153,7 +153,7 @@ def test_a_guard_time_that_is_not_a_number_raises() -> None:
 
 
 @pytest.mark.slow
-def test_the_kernel_kills_a_suspended_process_half_a_guard_time_after_its_deadline() -> None:
+def test_kernel_kills_a_suspended_process_after_the_mastership_deadline() -> None:
     with keeper(0.4, 0.3) as process:
         until_ns = until_of(process)
         process.send_signal(signal.SIGSTOP)
@@ -162,7 +162,7 @@ def test_the_kernel_kills_a_suspended_process_half_a_guard_time_after_its_deadli
 
 
 @pytest.mark.slow
-def test_a_process_that_renews_its_lease_in_time_is_not_killed() -> None:
+def test_process_is_not_killed_if_mastership_is_extended_in_time() -> None:
     then = (
         "for n in range(40):\n"
         " mastership.extend(time.clock_gettime_ns(time.CLOCK_BOOTTIME) + 4 * 10**9)\n"
@@ -177,7 +177,7 @@ def test_a_process_that_renews_its_lease_in_time_is_not_killed() -> None:
 @pytest.mark.parametrize(
     "end", ["mastership.end()", "del mastership; import gc; gc.collect(); mastership = Mastership()"]
 )
-def test_a_process_that_gave_up_its_right_to_send_is_not_killed(end: str) -> None:
+def test_process_is_not_killed_after_ending_its_mastership(end: str) -> None:
     with keeper(1.0, 0.2, f"{end}; time.sleep(1.5)") as process:
         assert until_of(process) == 0
         assert process.poll() is None
@@ -250,7 +250,7 @@ def test_a_suspended_master_sends_nothing_after_it_resumes() -> None:
 @WATCHES_SUSPENSION
 @pytest.mark.long
 @pytest.mark.slow
-def test_a_suspended_master_with_a_deadline_that_is_too_late_does_send() -> None:
+def test_suspended_master_sends_if_its_deadline_is_too_late() -> None:
     """This shows that the tests above can fail: here the master's deadline is too late."""
     with fence(beyond=1000) as made:
         found = rounds(made, 4)

@@ -213,7 +213,7 @@ SHOW_NICE = [sys.executable, "-ISc", "import os; print(os.getpriority(os.PRIO_PR
 
 @SHOWS_SCHEDULING
 @pytest.mark.usefixtures("_usual_nice")
-def test_only_the_threads_that_pass_on_values_run_before_normal_threads(realtime: Realtime) -> None:
+def test_only_threads_that_deliver_values_get_higher_priority(realtime: Realtime) -> None:
     """They are the poller's thread, and each thread that has taken values."""
     taker = threading.get_native_id()
     with Poller(Plant(()), realtime=True) as poller:
@@ -245,7 +245,7 @@ def test_one_warning_explains_how_to_permit_nice_values(
 
 @SHOWS_SCHEDULING
 @pytest.mark.usefixtures("_usual_nice")
-def test_a_thread_with_its_own_scheduling_keeps_it(realtime: Realtime) -> None:
+def test_thread_keeps_a_scheduling_policy_set_by_the_user(realtime: Realtime) -> None:
     own = os.sched_getscheduler(0)
     os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     try:
@@ -257,7 +257,7 @@ def test_a_thread_with_its_own_scheduling_keeps_it(realtime: Realtime) -> None:
 
 
 @SHOWS_SCHEDULING
-def test_values_are_taken_more_often_if_realtime_was_granted() -> None:
+def test_values_are_taken_more_often_with_realtime_scheduling() -> None:
     poller = Poller(Plant(()))
     assert poller._interval_s(BATCHES_S) == BATCHES_S
     poller._realtime.is_held = True
@@ -314,7 +314,9 @@ process.flush_log(10)
 
 @SHOWS_SCHEDULING
 @pytest.mark.long
-def test_a_flood_ends_realtime_scheduling(realtime: Realtime, caplog: pytest.LogCaptureFixture) -> None:
+def test_realtime_scheduling_ends_during_a_flood_of_bytes(
+    realtime: Realtime, caplog: pytest.LogCaptureFixture
+) -> None:
     """The C core's thread discards bytes that a program sends as fast as the computer can."""
     near, far = socket.socketpair()
     near.setblocking(False)

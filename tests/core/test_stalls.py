@@ -141,7 +141,7 @@ class Device:
                 self._adapter.recv(8)
 
 
-def test_a_stop_is_written_to_a_stalled_adapter_but_another_command_is_not(ends: Ends, port: Port) -> None:
+def test_stalled_adapter_gets_stops_but_no_other_commands(ends: Ends, port: Port) -> None:
     assert port.carry_out(exchange(READ)).result == Failure.NO_REPLY
     assert port.is_stalled
     start = port.carry_out(exchange(START))
@@ -152,7 +152,9 @@ def test_a_stop_is_written_to_a_stalled_adapter_but_another_command_is_not(ends:
 
 
 @pytest.mark.parametrize("insists", [False, True], ids=["read", "read of a stop"])
-def test_a_stop_during_a_stall_is_sent_after_at_most_one_read(ends: Ends, port: Port, insists: bool) -> None:
+def test_only_one_read_is_written_to_a_stalled_adapter_before_a_stop(
+    ends: Ends, port: Port, insists: bool
+) -> None:
     peer = Peer(least_timeout=TIMEOUT_S, most_timeout=TIMEOUT_S)
     assert port.carry_out(exchange(READ)).result == Failure.NO_REPLY
     for _ in range(3):
@@ -164,7 +166,7 @@ def test_a_stop_during_a_stall_is_sent_after_at_most_one_read(ends: Ends, port: 
     assert taken(ends[1]) == [frame(READ), frame(STOP)]
 
 
-def test_a_stop_does_not_wait_for_a_read_that_waits_for_a_stalled_adapter(ends: Ends, port: Port) -> None:
+def test_stop_overtakes_reads_that_wait_for_a_stalled_adapter(ends: Ends, port: Port) -> None:
     """The read is sent after the stop, once the adapter has taken the stop and the earlier read."""
     assert port.carry_out(exchange(READ)).result == Failure.NO_REPLY
     port.submit([exchange(OTHER)] + [exchange(OTHER, timeout=0.2)] * 64, [0] * 65)
@@ -262,7 +264,7 @@ def patient(message: Message) -> Exchange:
     return exchange(message, timeout=PATIENCE)
 
 
-def test_a_count_of_unsent_bytes_that_stays_above_0_is_ignored(ends: Ends, port: Port) -> None:
+def test_unsent_byte_count_is_ignored_if_always_above_0(ends: Ends, port: Port) -> None:
     requests = [READ, OTHER, READ, START, SILENT, OTHER]
     with Device(ends[1], len(requests), miscounted=0) as device:
         for request in requests[:4]:
@@ -275,7 +277,7 @@ def test_a_count_of_unsent_bytes_that_stays_above_0_is_ignored(ends: Ends, port:
 
 
 @pytest.mark.long
-def test_a_wrong_count_of_unsent_bytes_does_not_delay_other_drives(ends: Ends, port: Port) -> None:
+def test_wrong_unsent_byte_count_does_not_stall_other_drives(ends: Ends, port: Port) -> None:
     requests = [READ, OTHER, SILENT, READ, SILENT]
     with Device(ends[1], len(requests), miscounted=0):
         for request in requests[:2]:
@@ -287,7 +289,7 @@ def test_a_wrong_count_of_unsent_bytes_does_not_delay_other_drives(ends: Ends, p
 
 
 @pytest.mark.parametrize(("failures", "was_wrong", "seconds"), [(0, 0, 30), (1, 0, 40), (0, 1, 1), (1, 1, 1)])
-def test_a_stalled_request_waits_longer_if_its_drive_failed_before(
+def test_wait_for_a_stalled_adapter_depends_on_earlier_failures(
     failures: int, was_wrong: int, seconds: int
 ) -> None:
     peer, line = Peer(least_timeout=1, most_timeout=1), LineDriver()
@@ -296,7 +298,7 @@ def test_a_stalled_request_waits_longer_if_its_drive_failed_before(
     assert lib.md_line_hold_ns(line._line, was_wrong) == seconds * 10**9
 
 
-def test_a_wrong_count_of_unsent_bytes_is_ignored_after_three_replies(ends: Ends, port: Port) -> None:
+def test_wrong_unsent_byte_count_is_ignored_after_three_replies(ends: Ends, port: Port) -> None:
     with Device(ends[1], 6, miscounted=2):
         for _ in range(3):
             assert port.carry_out(patient(READ)).result > 0
@@ -308,7 +310,7 @@ def test_a_wrong_count_of_unsent_bytes_is_ignored_after_three_replies(ends: Ends
     assert port.miscounts
 
 
-def test_a_delayed_count_of_unsent_bytes_is_not_ignored(ends: Ends, port: Port) -> None:
+def test_unsent_byte_count_is_still_used_if_updated_late(ends: Ends, port: Port) -> None:
     with Device(ends[1], 5, lag=TIMEOUT_S / 2):
         for _ in range(5):
             assert port.carry_out(patient(READ)).result > 0
@@ -316,7 +318,7 @@ def test_a_delayed_count_of_unsent_bytes_is_not_ignored(ends: Ends, port: Port) 
     assert (port.miscounts, port.is_stalled) == (False, True)
 
 
-def test_a_stop_does_not_wait_for_an_outdated_count_of_unsent_bytes(ends: Ends, port: Port) -> None:
+def test_stop_does_not_wait_for_a_wrong_unsent_byte_count(ends: Ends, port: Port) -> None:
     """The port ignores a wrong count after three requests that waited for it. The stop does not wait."""
     stop = exchange(START, timeout=PATIENCE, insists=True)
     with Device(ends[1], 4, miscounted=0):

@@ -49,7 +49,7 @@ def tcp(transaction: int, body: bytes) -> bytes:
     return transaction.to_bytes(2) + b"\0\0" + len(body).to_bytes(2) + body
 
 
-def test_printed_tcp_frames_are_built_and_parsed() -> None:
+def test_tcp_frames_printed_in_manuals_are_built_and_parsed() -> None:
     read = Message(0xFF, 3, 4, 1, transaction=0x1501)
     assert build_request(TCP, read) == bytes.fromhex(GUIDE)
     assert parse_request(TCP, bytes.fromhex(GUIDE)) == (12, read)
@@ -198,7 +198,7 @@ def test_a_modbus_tcp_reply_may_come_in_pieces(line: LineDriver, drive: Peer, pi
 
 
 @pytest.mark.parametrize("cut", range(1, 11))
-def test_a_late_rest_of_a_reply_disturbs_no_exchange(line: LineDriver, drive: Peer, cut: int) -> None:
+def test_late_rest_of_an_incomplete_reply_is_skipped(line: LineDriver, drive: Peer, cut: int) -> None:
     late = value(ask(line, drive), 1)
     line.receive(late[:cut])
     line.wait_until_done()
@@ -253,7 +253,7 @@ def test_the_timeout_adapts_to_the_delay_of_a_late_tcp_reply(line: LineDriver, d
 
 
 @pytest.mark.parametrize("code", [0x0A, 0x0B])
-def test_a_gateways_exception_counts_as_no_reply(line: LineDriver, drive: Peer, code: int) -> None:
+def test_exception_sent_by_a_gateway_counts_as_no_reply(line: LineDriver, drive: Peer, code: int) -> None:
     for number in (1, 2):
         line.receive(tcp(ask(line, drive), bytes([1, 0x83, code])))
         assert (line.want, line.completion.result) == ("done", Failure.NO_REPLY)
@@ -305,7 +305,7 @@ def is_read(line: LineDriver, drive: Peer, raw: int, piece: int = 4096) -> bool:
 @pytest.mark.parametrize("piece", [1, 4096])
 @pytest.mark.parametrize("more", [b"", b"\0", b"\1\2\3"], ids=["short", "a byte more", "three bytes more"])
 @pytest.mark.parametrize("length", [0, 1, 2, 4, 6, 9, 254, 255, 0xFFFF])
-def test_an_exception_has_two_bytes_even_if_its_header_states_another_length(
+def test_exception_reply_is_read_despite_a_wrong_header_length(
     line: LineDriver, drive: Peer, length: int, more: bytes, piece: int
 ) -> None:
     assert is_read(line, drive, 1)
@@ -317,7 +317,7 @@ def test_an_exception_has_two_bytes_even_if_its_header_states_another_length(
 
 @pytest.mark.parametrize("piece", [1, 6, 4096])
 @pytest.mark.parametrize("length", [0, 2, 4, 6, 12, 255])
-def test_a_reply_with_a_wrong_length_in_its_header_fails_only_its_exchange(
+def test_wrong_length_in_a_tcp_header_fails_only_one_exchange(
     line: LineDriver, drive: Peer, length: int, piece: int
 ) -> None:
     assert is_read(line, drive, 1)
@@ -331,7 +331,9 @@ def test_a_reply_with_a_wrong_length_in_its_header_fails_only_its_exchange(
 
 @pytest.mark.parametrize("missing", range(1, 10))
 @pytest.mark.parametrize("transactions", [Transactions.MATCHED, Transactions.IGNORED])
-def test_a_short_reply_fails_only_its_exchange(drive: Peer, missing: int, transactions: Transactions) -> None:
+def test_short_tcp_reply_fails_only_one_exchange(
+    drive: Peer, missing: int, transactions: Transactions
+) -> None:
     line = LineDriver(transactions)
     assert is_read(line, drive, 1)
     line.receive(value(ask(line, drive), 7)[:-missing])
@@ -343,7 +345,7 @@ def test_a_short_reply_fails_only_its_exchange(drive: Peer, missing: int, transa
     assert not line.is_out_of_step
 
 
-def test_a_frame_that_started_before_the_request_is_not_its_reply(line: LineDriver, drive: Peer) -> None:
+def test_reply_frame_begun_before_the_request_is_skipped(line: LineDriver, drive: Peer) -> None:
     following = ask(line, drive) + 1
     line.receive(value(following - 1, 1))
     assert line.want == "done"
@@ -354,7 +356,7 @@ def test_a_frame_that_started_before_the_request_is_not_its_reply(line: LineDriv
     assert line.data_after(value(following, 9)) == words(9)
 
 
-def test_frames_sent_by_the_peer_when_it_is_connected_are_not_replies(line: LineDriver, drive: Peer) -> None:
+def test_frames_sent_right_after_connecting_are_not_taken_for_replies(line: LineDriver, drive: Peer) -> None:
     """wills106/homeassistant-solax-modbus#2336: a registration and an exception with transaction id 1."""
     line.receive(tcp(1, b"\0\6ABCDEFGHIJ") + tcp(1, b"\0\x86\3"))
     assert is_read(line, drive, 7)
@@ -371,7 +373,7 @@ def test_an_incomplete_reply_fails_two_exchanges_if_bytes_come_singly(line: Line
 
 @pytest.mark.parametrize("piece", [1, 4096])
 @pytest.mark.parametrize("noise", [b"\0", b"\xff\xff", bytes(30), b"\1\3\2\0\7\xf9\x86"])
-def test_noise_after_good_replies_loses_neither_a_reply_nor_the_connection(
+def test_noise_after_good_replies_does_not_break_the_connection(
     line: LineDriver, drive: Peer, noise: bytes, piece: int
 ) -> None:
     for raw in range(5):
@@ -390,7 +392,7 @@ def test_a_copy_of_a_tcp_write_confirms_the_write(line: LineDriver, drive: Peer)
 @pytest.mark.parametrize(
     "header", ["00 01 00 01", "01 03 02 00 07 F9 86", "00 00 00 00 00 01", "3A 30 31 30"]
 )
-def test_bytes_that_are_not_a_header_end_the_connection(line: LineDriver, drive: Peer, header: str) -> None:
+def test_connection_ends_if_the_tcp_header_is_invalid(line: LineDriver, drive: Peer, header: str) -> None:
     ask(line, drive)
     assert not line.is_out_of_step
     line.receive(bytes.fromhex(header))

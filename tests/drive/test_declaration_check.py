@@ -155,7 +155,7 @@ WRITTEN: dict[str, dict[str, Any]] = {
 
 
 @table("mistake", WRITTEN)
-def test_declared_raw_count_that_no_write_can_send_is_reported(mistake: str) -> None:
+def test_declared_raw_count_is_reported_if_no_write_can_send_it(mistake: str) -> None:
     details = dict(WRITTEN[mistake])
     (sentence,) = mistakes_in(level=setting(5, details.pop("what", ""), **details))
     assert sentence.startswith(f"level: {mistake}")
@@ -223,7 +223,7 @@ def test_a_subclass_that_replaces_a_scale_register_is_reported() -> None:
     assert first.registers["level"].reach == range(5, 7)
 
 
-def test_a_word_and_parts_of_it_may_be_declared_at_one_address() -> None:
+def test_word_and_ranges_of_its_bits_may_share_an_address() -> None:
     fan = declare(
         status=setting(5), fault=reading(5, part=(0, 7)), runs=reading(5, part=(8, 8)), speed=reading(6)
     )
@@ -265,7 +265,7 @@ def test_each_error_of_a_wrong_drive_class_fits_on_one_line(wrong: dict[str, Any
         declare(v=register)
 
 
-def test_two_writable_registers_that_differ_at_one_address_are_reported() -> None:
+def test_different_writable_registers_at_one_address_are_reported() -> None:
     for other in (
         setting(8, "V", number_format=NumberFormat.I16),
         setting(8, "V", step=0.1),
@@ -278,7 +278,7 @@ def test_two_writable_registers_that_differ_at_one_address_are_reported() -> Non
     assert mistakes_in(volts=setting(8), other=setting(8, table=several, number_format=NumberFormat.U32))
 
 
-def test_register_that_writes_to_the_address_of_a_motor_command_is_reported() -> None:
+def test_register_writing_to_a_motor_commands_address_is_reported() -> None:
     run = command(0x20, Run, harmless=(0,))
     assert mistakes_in(run=run, speed=setting(9, "rpm", ram_address=0x20)) == (
         "speed: its ram_address is that of run, which commands the motor",
@@ -329,7 +329,7 @@ def test_one_register_object_with_two_names_is_reported() -> None:
     assert list(Base.registers) == ["speed", "torque"]
 
 
-def test_register_access_that_its_table_does_not_allow_is_reported() -> None:
+def test_register_is_reported_if_its_table_forbids_the_access() -> None:
     blind = Table("output", None, 0x06)
     assert mistakes_in(v=reading(1, table=blind)) == (
         "v: an output cannot be read, so it cannot hold a reading",

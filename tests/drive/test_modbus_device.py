@@ -80,7 +80,7 @@ def test_modbus_device_reads_back_the_registers_that_it_wrote(meter: BusAndDevic
     assert [request.function for request, _ in line.frames] == [6, 3, 16, 3]
 
 
-def test_a_number_and_a_coil_are_written_without_a_list(meter: BusAndDevice) -> None:
+def test_single_value_can_be_written_without_a_list(meter: BusAndDevice) -> None:
     _, device = meter
     assert device.write_holding(5, 7, confirm=True) == [7]
     assert device.write_coils(3, True, confirm=True) == [True]
@@ -101,7 +101,7 @@ def test_one_number_is_written_with_function_10h_if_multiple_is_true(meter: BusA
     assert [request.function for request, _ in line.frames] == [16, 3, 15, 1]
 
 
-def test_a_mask_write_changes_only_bits_that_its_first_mask_clears(meter: BusAndDevice) -> None:
+def test_mask_write_fails_if_the_written_bits_read_back_differently(meter: BusAndDevice) -> None:
     line, device = meter
     held = ["12 34"]
     answers = {0x16: "07 16 00 05 FF F0 00 04", 3: "07 03 02 "}

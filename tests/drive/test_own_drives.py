@@ -211,7 +211,7 @@ def acknowledged(request: Message) -> bytes | None:
     return bytes.fromhex("01 86 05 82 63") if request.function == 6 else None  # checksum computed by pymodbus
 
 
-def test_a_write_that_is_answered_with_exception_05_is_unconfirmed() -> None:
+def test_write_is_unconfirmed_if_answered_with_exception_05() -> None:
     """Exception 05 means: accepted and being processed (application protocol V1.1b3, section 7)."""
     line = SimulatedBus(simulated(Known(1)))
     drive = line.attach(Known(1))
@@ -250,7 +250,7 @@ def test_a_setting_can_be_declared_to_move_the_motor() -> None:
     assert len(line.written) == 1
 
 
-def test_plant_file_may_confirm_the_make_of_a_drive(tmp_path: Path) -> None:
+def test_plant_file_can_set_the_option_confirmed(tmp_path: Path) -> None:
     (tmp_path / "pump.py").write_text(
         "from multidrop import Drive, command, reading\n"
         "class Pump(Drive):\n    speed = reading(1)\n    run = command(2)\n"

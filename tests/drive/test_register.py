@@ -148,7 +148,7 @@ def test_typed_text_is_parsed_to_a_value() -> None:
         Example.run.parse("go|stop")
 
 
-def test_a_32_bit_register_has_two_addresses() -> None:
+def test_32_bit_register_has_two_words() -> None:
     assert (Example.energy.words, Example.current.words, Example.coil.words) == (2, 1, 1)
 
 
@@ -385,7 +385,7 @@ def test_a_scan_reads_text_registers_to_identify_families() -> None:
     assert _read(Known(1), Known.maker, ask) == "ABB"
 
 
-def test_a_text_register_cannot_be_polled_or_read_from_another_family() -> None:
+def test_misuse_of_a_text_register_raises_an_error() -> None:
     class Other(Drive):
         """Another family with a text register at the same address."""
 

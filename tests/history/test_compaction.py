@@ -271,7 +271,9 @@ def _readable(path: Path) -> list[Row]:
 
 @pytest.mark.long
 @pytest.mark.parametrize("content", usually(b"\0" * 5000, b"", b"\xff\xff\xff\xff"))
-def test_segments_beside_an_empty_one_are_read(tmp_path: Path, rows: list[list[Row]], content: bytes) -> None:
+def test_other_segments_are_read_if_one_is_empty(
+    tmp_path: Path, rows: list[list[Row]], content: bytes
+) -> None:
     """After a power cut a file may be empty or contain zeros."""
     (tmp_path / "rows.00000002.arrows").write_bytes(content)
     left = [*chain(rows[0], *rows[2:])]
@@ -310,7 +312,7 @@ def test_compaction_runs_at_the_lowest_priority_if_allowed(monkeypatch: pytest.M
 
 
 @pytest.mark.slow
-def test_compaction_does_not_inherit_the_real_time_scheduling_of_its_recorder() -> None:
+def test_compaction_process_does_not_inherit_real_time_scheduling() -> None:
     """If this process may not use SCHED_RR, the recorder has the usual scheduling."""
     lines = (
         "import contextlib, os",

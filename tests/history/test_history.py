@@ -268,7 +268,7 @@ def test_segments_written_by_poll_are_read_as_a_history(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_segments_beside_a_damaged_segment_are_read(tmp_path: Path) -> None:
+def test_other_segments_are_read_if_one_is_damaged(tmp_path: Path) -> None:
     rows = [
         random_rows(number, NOON + number * 60 * SECOND, count) for number, count in enumerate((20, 120, 20))
     ]
@@ -382,7 +382,9 @@ def test_duckdb_uses_a_private_temporary_folder(tmp_path: Path, monkeypatch: pyt
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_reader_copes_with_replaced_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_history_read_is_repeated_if_files_are_replaced_meanwhile(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Each file that the reader lists is replaced before it is read, as may happen on a busy machine."""
     record(tmp_path, [random_rows(1, NOON, 100)])
     replaced = iter(range(20))
@@ -429,7 +431,7 @@ def test_a_segment_of_version_0_1_with_too_many_names_is_damaged(tmp_path: Path)
 @pytest.mark.slow
 @pytest.mark.parametrize("points", [5, 20], ids=["ten-second summaries", "rows"])
 @pytest.mark.parametrize("compacted", [0, 1], ids="{} compacted".format)
-def test_infinite_values_are_missed_in_buckets(tmp_path: Path, compacted: int, points: int) -> None:
+def test_buckets_count_infinite_values_as_missed(tmp_path: Path, compacted: int, points: int) -> None:
     values = [1.0, inf, 3.0, -inf, 1.5]
     rows = [
         Row(NOON + at * SECOND // 10, DAY + at, 1, "pump-1", "speed", value, "ok")
@@ -449,7 +451,7 @@ def test_infinite_values_are_missed_in_buckets(tmp_path: Path, compacted: int, p
 
 
 @pytest.mark.parametrize("value", [0.1, 1.7e308, -1.7e308])
-def test_the_mean_of_equal_values_is_this_value(value: float) -> None:
+def test_mean_of_equal_values_is_exactly_that_value(value: float) -> None:
     """Their sum is rounded, or exceeds the largest float."""
     gathered = Accumulator(grid_of(0, 10, 1))
     gathered.add_rows([1] * 1000, [value] * 1000, [1] * 1000)

@@ -87,9 +87,7 @@ def test_closing_a_history_writer_writes_all_rows(tmp_path: Path, writers: Write
     assert writer.state().dropped == 20
 
 
-def test_batches_in_which_number_0_means_different_drives_are_recorded(
-    tmp_path: Path, writers: Writers
-) -> None:
+def test_batches_are_recorded_if_number_0_means_different_drives(tmp_path: Path, writers: Writers) -> None:
     """Batches come from several pollers, and each poller numbers its drives from 0."""
     writer = writers(tmp_path)
     taken = [
@@ -206,7 +204,7 @@ def test_only_one_process_records_into_a_history(tmp_path: Path, writers: Writer
         HistoryWriter(tmp_path, METADATA)
 
 
-def test_an_exception_in_the_history_writers_thread_does_not_end_it(
+def test_history_writer_thread_survives_an_exception(
     tmp_path: Path, writers: Writers, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def wrong(*_: object) -> object:
@@ -297,7 +295,7 @@ def test_the_names_of_history_files_have_segment_numbers_and_times() -> None:
     assert file_name(7, 9, 0, 1) == "00000007-00000009.19700101T000000Z-19700101T000001Z.parquet"
 
 
-def test_files_whose_segments_are_all_in_a_merged_file_are_omitted() -> None:
+def test_file_is_omitted_if_a_merged_file_has_all_its_segments() -> None:
     def file(first: int, last: int) -> HistoryFile:
         return HistoryFile(Path(f"{first}-{last}"), first, last, 0, 0)
 

@@ -104,7 +104,7 @@ def test_buckets_of_a_range_with_one_unit_have_that_unit(tmp_path: Path, how: st
         ({}, AMPERE, ("A", 30, ("",))),
     ],
 )
-def test_values_with_equal_units_or_names_are_combined(
+def test_values_with_equal_units_or_value_names_are_combined(
     tmp_path: Path, first: dict[str, Any], second: dict[str, Any], told: tuple[str, int, tuple[str, ...]]
 ) -> None:
     recorded(tmp_path, first, second)
@@ -190,7 +190,7 @@ def test_columns_keep_their_unit_while_the_history_grows(tmp_path: Path) -> None
         assert columns_of(history.read(SERIES)) == {SERIES: {50.0}, f"{SERIES} [A]": {1.0}}
 
 
-def test_registers_with_different_value_names_have_two_columns(tmp_path: Path) -> None:
+def test_register_gets_two_columns_if_its_value_names_change(tmp_path: Path) -> None:
     recorded(tmp_path, STATES, OTHER_STATES, AMPERE)
     with History(tmp_path) as history:
         rows = history.read(SERIES)

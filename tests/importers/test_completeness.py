@@ -226,7 +226,7 @@ def test_key_that_an_importer_does_not_know_is_reported_with_its_register(
     assert "novel is not known here, and was not carried over" in gaps(device, "a")
 
 
-def test_settings_of_a_hub_that_are_not_imported_are_reported(tmp_path: Path) -> None:
+def test_unimported_settings_of_a_home_assistant_hub_are_reported(tmp_path: Path) -> None:
     pytest.importorskip("yaml")
     hub = f"modbus:\n  - name: hub\n    delay: 5\n    novel: 1\n    timeout: 3\n    sensors: [{SENSOR}}}]\n"
     assert omissions(only(tmp_path, "a.yaml", hub)) == [
@@ -354,7 +354,7 @@ def test_template_parameters_nested_devices_and_comments_are_read(bench: Any, tm
     }
 
 
-def test_device_entries_that_conflict_in_one_drive_class_are_counted(bench: Any, tmp_path: Path) -> None:
+def test_template_with_conflicting_entries_is_counted_as_refused(bench: Any, tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text(wb([{"address": 5, "scale": 0.1}, {"address": 5, "scale": 1}]))
     coverage = covered(bench, tmp_path)
     assert (coverage.whole, coverage.refused.total()) == (0, 1)

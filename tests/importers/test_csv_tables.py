@@ -124,7 +124,7 @@ def test_a_column_named_decimal_in_a_neuron_table_is_a_factor(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("one", ["1", "1.0", "1,0", "1.000"])
-def test_a_scale_of_one_in_a_csv_table_does_not_hide_a_divisor(tmp_path: Path, one: str) -> None:
+def test_csv_divisor_is_used_if_the_scale_is_one(tmp_path: Path, one: str) -> None:
     device = only(tmp_path, "t.csv", f"name;address;type;scale;divisor\na;0x10;uint16;{one};10\n")
     assert (entries(device)["a"], found(device)) == ({"at": 16, "step": 0.1}, [])
 

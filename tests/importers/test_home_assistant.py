@@ -38,7 +38,7 @@ def sensor(folder: Path, keys: str, kind: str = "sensors") -> ImportedDevice:
         ('data_type: custom, count: 1, structure: ">H"', None),
     ],
 )
-def test_a_home_assistant_sensor_has_the_width_of_its_count_or_structure(
+def test_home_assistant_sensor_width_follows_count_or_structure(
     tmp_path: Path, keys: str, number_format: str | None
 ) -> None:
     device = sensor(tmp_path, keys)

@@ -97,7 +97,7 @@ def test_telegraf_request_without_a_slave_id_is_reported(tmp_path: Path) -> None
     ]
 
 
-def test_pauses_that_telegraf_keeps_for_a_device_are_reported(tmp_path: Path) -> None:
+def test_telegraf_pause_settings_are_reported_as_not_imported(tmp_path: Path) -> None:
     workaround = '[inputs.modbus.workarounds]\npause_after_connect = "1s"\n'
     device = of_a_request(tmp_path, 'address = 5, type = "INT16"', workaround)
     assert omissions(device) == ["workarounds: pause_after_connect was not carried over"]

@@ -99,7 +99,7 @@ def test_wb_mqtt_subdevices_of_unknown_address_are_reported_as_not_imported(
         ({"format": "s8"}, {"number_format": "I8"}),
     ],
 )
-def test_bits_of_a_wb_mqtt_serial_register_are_imported_as_a_part_of_the_word(
+def test_bits_of_a_wb_mqtt_register_are_imported_as_a_bit_range(
     tmp_path: Path, keys: dict[str, Any], expected: dict[str, Any]
 ) -> None:
     device = channel(tmp_path, **keys)
@@ -166,7 +166,7 @@ def test_parts_of_a_composite_wb_mqtt_serial_channel_are_reported(tmp_path: Path
     assert gaps(device, "a") == ["its place in a larger channel was not carried over"]
 
 
-def test_value_names_are_imported_if_their_numbers_are_text(tmp_path: Path) -> None:
+def test_wb_mqtt_value_names_are_imported_if_numbers_are_strings(tmp_path: Path) -> None:
     named = channel(tmp_path, enum=["0", "2"], enum_titles=["off", "on"])
     assert entries(named)["a"]["values"] == {"off": 0, "on": 2}
 

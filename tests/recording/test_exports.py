@@ -134,7 +134,7 @@ def test_hdf5_has_the_rows_of_the_recording(tmp_path: Path) -> None:
         assert json.loads(file["metadata"][()]) == METADATA
 
 
-def test_the_time_in_an_mdf4_group_never_decreases_although_the_clock_was_set_back(
+def test_mdf4_times_never_decrease_if_the_clock_is_set_back(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from asammdf import MDF
@@ -153,7 +153,7 @@ def test_the_time_in_an_mdf4_group_never_decreases_although_the_clock_was_set_ba
     assert sorted(found) == sorted(times)
 
 
-def test_an_export_has_the_names_of_negative_values(tmp_path: Path) -> None:
+def test_export_includes_value_names_of_negative_numbers(tmp_path: Path) -> None:
     import h5py
     from asammdf import MDF
 

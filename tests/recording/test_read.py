@@ -89,7 +89,7 @@ def test_a_recording_with_invalid_metadata_is_read(tmp_path: Path, about: dict[s
     assert pa.table(multidrop.open_recording(path).wide(PUMP)).column(PUMP).to_pylist() == [50.0]
 
 
-def test_tables_of_a_damaged_recording_raise_the_readers_error(tmp_path: Path) -> None:
+def test_converting_a_damaged_recording_to_a_table_names_the_bad_line(tmp_path: Path) -> None:
     path = record(tmp_path / "run.csv", [row(at, "pump", "output_frequency", 50.0) for at in range(4)])
     path.write_text(path.read_text().replace("pump,", "pump;", 1))
     for take, library in (("to_pandas", "pandas"), ("to_polars", "polars"), ("wide", "json")):
@@ -99,7 +99,7 @@ def test_tables_of_a_damaged_recording_raise_the_readers_error(tmp_path: Path) -
             getattr(multidrop.open_recording(path), take)()
 
 
-def test_a_file_that_is_not_a_recording_is_an_error(tmp_path: Path) -> None:
+def test_opening_a_wrong_or_missing_recording_raises_an_error(tmp_path: Path) -> None:
     (tmp_path / "run.txt").write_text("")
     with pytest.raises(ValueError, match=r"a recording's name must end in \.arrows, \.csv, \.parquet"):
         multidrop.open_recording(tmp_path / "run.txt")
@@ -114,7 +114,7 @@ def test_the_steps_of_command_scripts_are_public_names() -> None:
     assert next(steps.wait(2.0)) == Wait(2.0)
 
 
-def test_a_writer_replaces_a_recording_only_when_asked(path: Path) -> None:
+def test_existing_recording_is_replaced_only_with_overwrite_true(path: Path) -> None:
     with pytest.raises(FileExistsError, match=r"exists already: name another file, or remove it first"):
         open_writer(path, METADATA)
     with open_writer(path, {"second": True}, overwrite=True):

@@ -114,7 +114,7 @@ def test_every_batch_can_be_read_before_the_recording_is_closed(tmp_path: Path, 
 
 
 @pytest.mark.parametrize("suffix", [".arrows", ".csv"])
-def test_a_reader_ends_where_the_recording_ended_when_it_was_opened(tmp_path: Path, suffix: str) -> None:
+def test_recording_reader_stops_at_the_end_seen_at_opening(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
     with open_writer(path, METADATA) as writer:
         writer.write(counting(10))
@@ -170,7 +170,7 @@ def test_duckdb_opens_parquet_and_csv(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("is_before", [False, True])
-def test_a_name_that_ends_within_a_character_is_reported_as_damage(tmp_path: Path, is_before: bool) -> None:
+def test_name_cut_within_a_utf_8_character_is_reported_as_damage(tmp_path: Path, is_before: bool) -> None:
     path = tmp_path / "a.arrows"
     some = from_rows([Row(0, 0, None, name, "r", None, "no reply") for name in ("h\u00e9", "x")])
     if is_before:
@@ -278,7 +278,7 @@ def as_text(name: str) -> str:
 
 @settings(max_examples=examples(60), deadline=None)
 @given(some=st.lists(st.one_of(SAMPLE, MISS), min_size=1, max_size=20))
-def test_any_csv_recording_has_the_same_rows_in_pythons_csv_module(
+def test_pythons_csv_module_reads_the_same_rows_from_any_recording(
     tmp_path_factory: pytest.TempPathFactory, some: list[Row]
 ) -> None:
     path = tmp_path_factory.mktemp("any") / "a.csv"
@@ -298,7 +298,7 @@ def test_any_csv_recording_has_the_same_rows_in_pythons_csv_module(
 FORMULAS = ("=1+1", "+cmd|' /C calc'!A0", "-2", "@SUM(A1)", "\t=1", "\r=1", "'=1", "''-", "'old'", "a=b", "")
 
 
-def test_no_text_in_a_csv_is_a_formula_and_all_texts_are_read_back(tmp_path: Path) -> None:
+def test_csv_texts_that_look_like_formulas_are_escaped(tmp_path: Path) -> None:
     some = [Row(1, 1, None, name, name, None, name) for name in FORMULAS]
     with open_writer(tmp_path / "a.csv", {}) as writer:
         writer.write(from_rows(some))
@@ -322,7 +322,7 @@ def test_converting_keeps_rows_and_metadata(tmp_path: Path, suffix: str, target:
 @pytest.mark.uncounted
 @pytest.mark.slow
 @pytest.mark.long
-def test_converting_needs_memory_for_few_batches(tmp_path: Path) -> None:
+def test_conversion_keeps_only_a_few_batches_in_memory(tmp_path: Path) -> None:
     """Converting a recording of 13 MB uses at most 6.5 MB of memory."""
     tracemalloc = pytest.importorskip("tracemalloc")
     with open_writer(tmp_path / "a.arrows", {}) as writer:
@@ -414,7 +414,7 @@ def test_metadata_that_json_cannot_hold_raises_type_error(tmp_path: Path, suffix
 
 
 @every_format
-def test_a_writer_may_be_closed_twice_and_later_writes_fail(tmp_path: Path, suffix: str) -> None:
+def test_closed_writer_refuses_later_writes(tmp_path: Path, suffix: str) -> None:
     writer: RecordingWriter = open_writer(tmp_path / f"a{suffix}", {})
     writer.write(example())
     writer.close()

@@ -95,7 +95,7 @@ def test_a_file_cut_between_a_dictionary_and_its_batch_is_readable(tmp_path: Pat
         assert polars.read_ipc_stream(path)["drive"].to_list() == expected
 
 
-def test_the_names_in_a_failed_batch_are_written_with_the_next_one(tmp_path: Path) -> None:
+def test_names_of_a_failed_batch_are_written_with_the_next_batch(tmp_path: Path) -> None:
     path = tmp_path / "a.arrows"
     with open_writer(path, METADATA) as writer:
         for room in (0, 100, 700):
@@ -183,7 +183,7 @@ def test_a_repair_leaves_a_whole_recording_unchanged(tmp_path: Path, suffix: str
     assert path.read_bytes() == before
 
 
-def test_the_end_marker_of_an_arrow_stream_is_not_a_truncated_end(tmp_path: Path) -> None:
+def test_arrow_end_marker_does_not_count_as_truncated_data(tmp_path: Path) -> None:
     path = tmp_path / "a.arrows"
     table = pa.table(example())
     with pa.ipc.new_stream(path, table.schema) as stream:
@@ -230,7 +230,7 @@ def test_a_killed_writer_keeps_all_written_batches(tmp_path: Path, suffix: str) 
         assert [row.value for row in found] == [next(expected) for _ in found]
 
 
-def test_the_error_for_a_parquet_file_that_was_not_closed_says_so(tmp_path: Path) -> None:
+def test_error_says_that_a_parquet_file_was_not_closed(tmp_path: Path) -> None:
     path = tmp_path / "a.parquet"
     with open_writer(path, METADATA) as writer:
         writer.write(example())
@@ -276,7 +276,7 @@ def test_the_error_about_a_full_disk_says_how_many_rows_are_saved(tmp_path: Path
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
-def test_a_full_disk_refuses_a_recording(tmp_path: Path, suffix: str) -> None:
+def test_recording_to_a_full_disk_raises_an_error(tmp_path: Path, suffix: str) -> None:
     if not Path("/dev/full").exists():
         pytest.skip("needs /dev/full")
     path = tmp_path / f"a{suffix}"
@@ -378,7 +378,7 @@ class Halving:
 
 
 @pytest.mark.parametrize("room", range(0, 120, 10))
-def test_a_csv_with_a_header_has_its_metadata(tmp_path: Path, room: int) -> None:
+def test_csv_header_is_written_only_after_the_metadata_file(tmp_path: Path, room: int) -> None:
     """The disk becomes full after `room` bytes. If the .csv has a header, its .csv.json must be complete."""
     path = tmp_path / "a.csv"
     whole = {"plant": "p" * 60}

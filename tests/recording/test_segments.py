@@ -138,7 +138,7 @@ def test_an_incomplete_batch_of_a_killed_writer_is_cut_off(tmp_path: Path) -> No
     assert pa.ipc.open_stream(segment.read_bytes()).read_all().num_rows == 3
 
 
-def test_a_long_unreadable_end_is_never_cut_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_long_unreadable_end_of_a_segment_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(segments_module, "MOST_CUT", 100)
     path = tmp_path / "run.arrows"
     with SegmentWriter(path, ABOUT, every=60) as writer:
@@ -183,7 +183,7 @@ def test_old_segments_are_removed_when_a_segment_starts(tmp_path: Path, hand: Ha
     assert names(tmp_path) == ["run.00000008.arrows"]
 
 
-def test_the_oldest_segments_beyond_the_size_are_removed(tmp_path: Path, hand: Hand) -> None:
+def test_oldest_segments_are_removed_above_the_size_limit(tmp_path: Path, hand: Hand) -> None:
     with SegmentWriter(tmp_path / "run.arrows", ABOUT, every=DAY, most=10_000) as writer:
         for number in range(20):
             writer.write(rows(number))
@@ -218,7 +218,7 @@ def test_files_beyond_the_limit_of_age_or_size_are_removed() -> None:
     assert gone(5.0, 1.0, None) == []  # the clock was set back: all files count as new
 
 
-def test_a_clock_that_jumps_removes_no_segment() -> None:
+def test_clock_jump_removes_no_segment() -> None:
     week = [StoredFile(Path(str(number)), number, number * DAY, 100) for number in range(1, 8)]
 
     def left(now: float, files: list[StoredFile]) -> list[int]:
@@ -334,7 +334,7 @@ def test_triggers_close_together_each_have_a_complete_file(writer: TriggeredWrit
     assert open_recording(writer.files[1]).metadata["trigger"]["condition"] == "key t"
 
 
-def test_an_event_does_not_end_a_trigger_recording_early(writer: TriggeredWriter) -> None:
+def test_later_comment_row_does_not_end_a_trigger_recording_early(writer: TriggeredWriter) -> None:
     writer.write(batch(0, 20, range(15, 16)))
     comment = AddedRow(UTC_0 + 60 * SECOND, 60 * SECOND, 0, 1, 0, status_code("late"), 0.0)
     writer.write(Batch(JoinedColumns(None, [comment]), DRIVES, REGISTERS))
@@ -342,7 +342,9 @@ def test_an_event_does_not_end_a_trigger_recording_early(writer: TriggeredWriter
     assert currents(writer.files[0]) == [float(at) for at in range(5, 36)]
 
 
-def test_all_recordings_close_if_one_fails(writer: TriggeredWriter, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_trigger_recordings_are_closed_if_closing_one_fails(
+    writer: TriggeredWriter, monkeypatch: pytest.MonkeyPatch
+) -> None:
     writer.write(batch(0, 20, range(15, 16), key_at=18))
     first, last = (recording.writer for recording in writer._open)
     close_last, close_first, closed = last.close, first.close, list[str]()
@@ -372,7 +374,7 @@ def test_triggers_beyond_the_limit_of_open_recordings_are_counted(writer: Trigge
     assert writer.dropped == 3
 
 
-def test_a_trigger_recording_keeps_only_the_rows_of_the_pre_trigger_time(writer: TriggeredWriter) -> None:
+def test_rows_older_than_the_pre_trigger_time_are_dropped(writer: TriggeredWriter) -> None:
     for at in range(1000):
         writer.write(batch(at, at + 1))
     assert len(writer._before) < 40

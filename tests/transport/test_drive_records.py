@@ -267,7 +267,7 @@ def test_each_value_is_decoded_from_its_bytes(data: bytes) -> None:
 
 @example(bytes(2 * WORDS - 1))
 @given(st.binary(max_size=2 * WORDS - 1))
-def test_a_short_reply_gives_the_values_whose_bytes_are_complete(data: bytes) -> None:
+def test_short_reply_yields_only_completely_received_values(data: bytes) -> None:
     block = Block.of(Mixed(1), REGISTERS)
     found = decoder_of(block).decode(reply(data))
     assert found == {one.name: one.value_in(data, one.address - FIRST) for one in REGISTERS}
@@ -278,7 +278,7 @@ def test_values_that_need_exact_arithmetic_are_decoded_in_python() -> None:
     assert set(decoder().names) == {one.name for one in REGISTERS} - {"pulses", "drift", "flow", "fine"}
 
 
-def test_drives_of_a_model_share_decoders_only_for_equal_blocks() -> None:
+def test_drives_of_one_model_share_a_decoder_for_equal_reads() -> None:
     assert decoder_of(Block.of(Mixed(2), REGISTERS)) is decoder()
     assert decoder_of(Block.of(Mixed(2), REGISTERS[1:])) is not decoder()
 
@@ -295,7 +295,7 @@ def picky(**faults: Any) -> tuple[Drive, Picky, SimulatedBus]:
     return drive, sim, bus
 
 
-def test_a_refused_request_is_split_until_the_port_is_reopened() -> None:
+def test_split_of_a_refused_read_is_kept_until_the_port_is_reopened() -> None:
     drive, sim, bus = picky(most=8)
     first = drive.read_many(drive.registers.values())
     assert first == expected_values(range(WIDE))
@@ -351,7 +351,7 @@ def test_a_request_to_a_busy_drive_is_not_split(code: int, monkeypatch: pytest.M
     assert sim.asked == [(0, WIDE)]
 
 
-def test_the_error_for_several_refused_registers_names_none(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_names_no_register_if_several_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     scaled = {"flow": reading(2, scale_register="power"), "power": reading(3, number_format=NumberFormat.I16)}
     drive = family(2, **scaled)(1, name="pump-1")
     bus = SimulatedBus(sim := Picky(drive))
@@ -386,7 +386,7 @@ def test_a_dead_drive_gets_only_one_additional_shorter_request() -> None:
 
 
 @pytest.mark.parametrize("silent", [{1}, {1, 2}, {0, 2}])
-def test_a_foreign_reply_to_only_one_attempt_is_reported(silent: set[int]) -> None:
+def test_wrong_address_is_reported_even_if_other_attempts_get_no_reply(silent: set[int]) -> None:
     """The attempts in `silent` get no reply. The other attempts get a reply from another address."""
     drive = family(2)(1, name="pump-1")
     bus = SimulatedBus(Picky(drive))
@@ -502,7 +502,7 @@ def test_a_raw_read_with_a_count_that_is_not_a_number_raises(
 
 
 @pytest.mark.parametrize("function", [1, 2, 3, 4])
-def test_a_raw_send_rejects_functions_that_read(simulated: SimulatedBus, toy: Drive, function: int) -> None:
+def test_send_raw_refuses_read_functions(simulated: SimulatedBus, toy: Drive, function: int) -> None:
     """A read sent as a write would wait so long that a late reply to an earlier read could be accepted."""
     with pytest.raises(
         ValueError, match=rf"{function:02X}H, which reads: call drive.read_raw\({function}, 80, 2\)"

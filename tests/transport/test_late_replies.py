@@ -117,7 +117,7 @@ def test_requests_no_longer_wait_after_two_unanswered_probes(
 
 
 @pytest.mark.parametrize("is_late", [True, False])
-def test_requests_wait_for_a_probe_that_the_drive_has_answered_before(
+def test_requests_wait_for_a_probe_if_the_drive_answered_one_before(
     line: LineDriver, drive: Peer, proof: Exchange, is_late: bool
 ) -> None:
     if is_late:
@@ -249,7 +249,7 @@ def test_replies_are_accepted_after_an_answered_probe(line: LineDriver, drive: P
     assert drive.counters().late == 0  # this drive has answered each request in time
 
 
-def test_a_reply_may_be_late_if_the_first_reply_was_an_exception(
+def test_value_after_a_first_exception_may_still_be_a_late_reply(
     line: LineDriver, drive: Peer, first: Exchange
 ) -> None:
     ask(line, drive, READ)
@@ -286,7 +286,7 @@ def test_the_first_reply_is_accepted_if_the_drive_has_no_probe(line: LineDriver,
 
 
 @pytest.mark.parametrize("least", [0, 1, 0xFFFF])
-def test_a_reply_is_recognised_by_its_known_value(line: LineDriver, drive: Peer, least: int) -> None:
+def test_probe_reply_is_accepted_only_with_the_known_value(line: LineDriver, drive: Peer, least: int) -> None:
     """The value can be 0, as that of Delixi's P04.28 is at 1200 baud."""
     known = exchange(READ, drive, answer=(least, least))
     drive.prove_by([known, exchange(OTHER, drive, answer=(7, 7))])
@@ -376,7 +376,7 @@ def test_late_replies_are_recognised_under_another_port_name(wire: HoldingWire, 
         assert bus.peer(bus.attach(QuickToy, 1)).owes
 
 
-def test_a_new_pseudo_terminal_with_a_used_number_has_another_identity() -> None:
+def test_reused_pseudo_terminal_number_gets_a_new_identity() -> None:
     def made() -> set[str]:
         ours, theirs = os.openpty()
         try:
@@ -390,7 +390,7 @@ def test_a_new_pseudo_terminal_with_a_used_number_has_another_identity() -> None
 
 
 @patient  # on a busy computer, the reply to the first attempt would come late
-def test_a_drive_without_late_replies_is_not_remembered(wire: HoldingWire) -> None:
+def test_drive_is_not_remembered_if_no_late_reply_is_expected(wire: HoldingWire) -> None:
     with Bus(wire.path) as bus:
         bus.attach(QuickToy, 1).read(QuickToy.output_current)
     assert not drive_records.identities_of(wire.path) & drive_records._former.keys()

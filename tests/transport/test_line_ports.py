@@ -61,14 +61,16 @@ def read_at_every_baud_rate(family: type[Drive]) -> None:
 
 
 @pytest.mark.long
-def test_every_documented_baud_rate_can_be_read() -> None:
-    """The library knows this value in advance, so it recognises a late reply to another read."""
+def test_drives_can_be_read_at_every_documented_baud_rate() -> None:
+    """The library knows the baud rate of a drive in advance, and may use it to recognise a late reply."""
     with ThreadPoolExecutor(len(MODELS)) as pool:
         list(pool.map(read_at_every_baud_rate, MODELS.values()))
 
 
 @pytest.mark.skipif(not hasattr(socket, "TCP_USER_TIMEOUT"), reason="this system knows no such time-out")
-def test_a_stalled_connection_is_closed_and_sends_nothing_later(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_socket_port_sets_tcp_user_timeout_against_stalled_connections(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """A loopback connection cannot stall, so this test reads the socket options."""
     told: list[int] = []
 
@@ -92,7 +94,7 @@ def test_the_echo_option_is_kept_when_a_port_is_reopened(echo: str, monkeypatch:
         assert told == [Echo(echo)] * 2
 
 
-def test_a_port_waits_and_discards_bytes_after_each_opening(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_port_waits_for_the_settle_time_after_each_opening(monkeypatch: pytest.MonkeyPatch) -> None:
     """Some gateways restart when their port is opened: they print text, and ignore requests for a while."""
     slept: list[float] = []
     with socket.create_server(("127.0.0.1", 0)) as listener:
@@ -152,7 +154,9 @@ def test_a_port_is_set_to_low_latency_mode(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 @table("refusal", [ValueError, OSError, NotImplementedError, AttributeError])
-def test_low_latency_mode_is_optional(monkeypatch: pytest.MonkeyPatch, refusal: type[Exception]) -> None:
+def test_port_works_if_low_latency_mode_is_refused(
+    monkeypatch: pytest.MonkeyPatch, refusal: type[Exception]
+) -> None:
     def refuse(port: Serial, wanted: bool) -> None:
         raise refusal
 
@@ -257,7 +261,7 @@ def test_a_port_that_is_open_cannot_be_opened_by_another_bus() -> None:
         Line(port).open().close()
 
 
-def test_ports_that_were_closed_or_failed_to_open_leave_no_descriptor_or_thread(tmp_path: Path) -> None:
+def test_closed_or_failed_ports_leave_no_descriptor_or_thread(tmp_path: Path) -> None:
     with Simulator([wire(), wire("socket://127.0.0.1:0")]) as sim:
         Line(sim.wires[0].path).open().close()  # opens descriptors that stay open in each process
         before = descriptors(), threads()

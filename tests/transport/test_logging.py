@@ -154,7 +154,7 @@ class Hanging(logging.Handler):
         self.released.wait(PATIENCE)
 
 
-def test_a_stop_is_repeated_although_a_log_handler_hangs() -> None:
+def test_stop_is_repeated_while_a_log_handler_hangs() -> None:
     line, drive, _ = one(InvtCHE(1))
     handler, logger = Hanging(), logging.getLogger("multidrop.control")
     line.answers = lambda request: b"" if len(line.frames) < 6 else None
@@ -171,7 +171,7 @@ def test_a_stop_is_repeated_although_a_log_handler_hangs() -> None:
         stop.join(PATIENCE)
 
 
-def test_the_queue_of_a_log_handler_that_hangs_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_log_queue_stays_bounded_while_a_handler_hangs(monkeypatch: pytest.MonkeyPatch) -> None:
     aside = process.AsideThread("log")
     monkeypatch.setattr(process, "_log_thread", aside)
     handler, logger = Hanging(), logging.getLogger("multidrop.line")

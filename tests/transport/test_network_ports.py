@@ -173,7 +173,7 @@ class HeldUp:
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="this system does not say when a request was written")
-def test_a_request_that_waited_behind_a_blocked_request_is_never_sent() -> None:
+def test_request_is_never_sent_after_waiting_behind_a_blocked_one() -> None:
     """The waiting request has expired, and may be a start."""
     port = HeldUp()
     bridge = Bridge(port)  # type: ignore[arg-type]
@@ -387,7 +387,7 @@ def start_into_the_cut(bus: Bus, toy: Toy, network: FarNetwork) -> None:
 
 @pytest.mark.long
 @pyserials_own
-def test_a_start_during_a_network_failure_never_arrives_after_the_port_closes(
+def test_start_command_in_a_network_failure_never_arrives_after_closing(
     far_network: FarNetwork,
 ) -> None:
     with Bus(far_network.url, echo="off", expiry=PATIENCE) as bus:
@@ -400,7 +400,7 @@ def test_a_start_during_a_network_failure_never_arrives_after_the_port_closes(
 @pytest.mark.slow
 @pyserials_own
 @pytest.mark.skipif(not hasattr(socket, "TCP_USER_TIMEOUT"), reason="this system knows no such time-out")
-def test_a_start_during_a_network_failure_never_arrives_while_the_port_is_open(
+def test_start_command_in_a_network_failure_never_arrives_on_the_open_port(
     far_network: FarNetwork,
 ) -> None:
     """The network is restored as soon as the call has returned."""

@@ -140,7 +140,7 @@ def test_a_port_is_reopened_only_with_the_same_adapter(
         (("1-1", "A1"), ("1-2", "A1"), [("1-3", "A1")], False),
     ],
 )
-def test_an_adapter_is_followed_to_its_new_name(
+def test_renamed_adapter_is_found_only_in_the_same_usb_socket(
     tmp_path: Path,
     before: tuple[str, str],
     now: tuple[str, str],
@@ -215,7 +215,7 @@ def test_a_new_pseudo_terminal_with_a_used_number_is_not_opened(tmp_path: Path, 
             assert found.is_lost
 
 
-def test_the_lasting_name_of_a_port_has_the_adapters_serial_number(
+def test_lasting_port_name_contains_the_adapters_serial_number(
     tmp_path: Path, sysfs: Sysfs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     by_id, names = tmp_path / "by-id", {}
@@ -247,7 +247,7 @@ def test_a_port_named_by_its_usb_socket_opens_with_any_adapter(
 
 
 @pytest.mark.slow
-def test_a_port_that_leads_to_another_line_is_not_polled_and_gets_no_stop(
+def test_port_leading_to_another_line_gets_neither_polls_nor_stops(
     tmp_path: Path, sysfs: Sysfs, caplog: pytest.LogCaptureFixture
 ) -> None:
     """The other line's drive would report a standstill while the intended motor keeps running."""
@@ -288,9 +288,7 @@ def test_a_port_that_leads_to_another_line_is_not_polled_and_gets_no_stop(
         ("socket://10.0.0.7:4001", errno.ETIMEDOUT, os.strerror(errno.ETIMEDOUT)),
     ],
 )
-def test_the_reason_of_a_loss_distinguishes_unplugged_stalled_and_hung_up_ports(
-    port: str, error: int, why: str
-) -> None:
+def test_port_loss_reason_says_unplugged_stalled_or_hung_up(port: str, error: int, why: str) -> None:
     assert why_lost(port, error) == why
 
 
@@ -303,7 +301,7 @@ def terminal() -> Iterator[str]:
 
 
 @pytest.mark.parametrize("must_discard", [False, True])
-def test_closing_a_stalled_port_discards_a_command_and_takes_limited_time(
+def test_stalled_port_closes_at_once_to_discard_a_command(
     must_discard: bool, terminal: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     closed: list[float] = []
@@ -362,9 +360,7 @@ def test_a_stalled_port_closes_in_time_if_no_descriptor_is_free(
     assert not port.is_open
 
 
-def test_the_reason_of_a_loss_is_known_before_the_port_is_reopened(
-    terminal: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_port_loss_reason_is_known_before_reopening(terminal: str, monkeypatch: pytest.MonkeyPatch) -> None:
     found = Line(terminal).open()
     core = SimpleNamespace(lost=True, lost_error=0, called_off=True, is_stalled=False, stop=lambda: None)
     found.queue = core  # type: ignore[assignment]
@@ -374,7 +370,7 @@ def test_the_reason_of_a_loss_is_known_before_the_port_is_reopened(
     found.close()
 
 
-def test_reads_reopen_a_port_that_was_closed_to_discard_a_command() -> None:
+def test_read_reopens_a_port_closed_to_discard_a_command() -> None:
     with Simulator([Wire([simulated(Toy(1))])]) as sim, Bus(sim.wires[0].path) as bus:
         toy = bus.attach(Toy, 1)
         assert bus.line.queue
@@ -406,7 +402,8 @@ def test_a_stalled_port_is_not_logged_as_lost_after_an_unsent_command(
     assert "lost" not in caplog.text
 
 
-def test_ctrl_c_leaves_no_command_in_the_driver(terminal: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ctrl_c_during_a_command_closes_the_port(terminal: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Otherwise the driver could still send the command."""
     found = Line(terminal).open()
 
     def interrupted(*given: object) -> None:
@@ -420,7 +417,7 @@ def test_ctrl_c_leaves_no_command_in_the_driver(terminal: str, monkeypatch: pyte
     found.close()
 
 
-def test_a_serial_driver_that_miscounts_its_unsent_bytes_is_logged_once(
+def test_wrong_unsent_byte_count_of_a_driver_is_logged_once(
     terminal: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(Port, "miscounts", True)
@@ -431,9 +428,7 @@ def test_a_serial_driver_that_miscounts_its_unsent_bytes_is_logged_once(
     assert caplog.text.count("its driver counts unsent bytes although replies came") == 1
 
 
-def test_the_error_for_a_silent_drive_behind_a_stalled_adapter_names_the_stall(
-    terminal: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_reply_error_mentions_a_stalled_adapter(terminal: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Line, "is_stalled", True)
     with Bus(terminal) as bus:
         toy = bus.attach(Toy, 1)

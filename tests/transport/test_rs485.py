@@ -137,7 +137,7 @@ def test_a_driver_without_rs485_raises_before_any_frame_is_sent(driver: Path) ->
 
 
 @pytest.mark.long
-def test_a_failure_to_switch_rts_loses_the_port_and_ends_sending(driver: Path) -> None:
+def test_port_is_lost_if_rts_can_no_longer_be_switched(driver: Path) -> None:
     said, events = play(driver, "rts-up", 9, RS485_CALLS=6)
     assert said[-1].endswith("its adapter failed")
     broken = [event.what for event in events].index("broken")
@@ -200,7 +200,9 @@ def test_rs485_is_read_from_a_plant_file(tmp_path: Path) -> None:
         ("socket://10.0.0.7:4001", '"kernel"', "socket://10.0.0.7:4001 is not one, so remove rs485"),
     ],
 )
-def test_an_invalid_line_option_is_one_mistake(tmp_path: Path, port: str, value: str, sentence: str) -> None:
+def test_invalid_rs485_option_in_a_plant_file_gives_one_error(
+    tmp_path: Path, port: str, value: str, sentence: str
+) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(PLANT.format(port, value))
     with pytest.raises(PlantError) as wrong:

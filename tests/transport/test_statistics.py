@@ -55,7 +55,7 @@ def test_delays_outside_the_range_of_the_buckets_are_counted_too(delay_ns: int) 
     assert 0 <= found.p50 <= found.p99 <= found.longest
 
 
-def test_the_buckets_of_delays_have_no_gap_between_them() -> None:
+def test_delay_histogram_buckets_have_no_gaps() -> None:
     edges = [delay_edge(bucket) for bucket in range(129)]
     assert edges == sorted(set(edges))
     assert edges[0] == 0
@@ -77,14 +77,14 @@ def test_a_delay_is_the_response_time_without_the_time_on_the_wire(line: LineDri
 
 
 @pytest.mark.parametrize("delay_ms", [0, 3, 20])
-def test_utilisation_includes_delays_and_silences(line: LineDriver, drive: Peer, delay_ms: int) -> None:
+def test_line_utilisation_includes_delays_and_silences(line: LineDriver, drive: Peer, delay_ms: int) -> None:
     for _ in range(10):
         answer(line, drive, delay_ms * MS)
     characters = (8 + 7) * CHARACTER
     assert drive.counters().ideal_ns == pytest.approx(10 * (characters + delay_ms * MS + SILENCE), rel=0.1)
 
 
-def test_the_utilisation_of_a_port_above_its_baud_rate_is_at_most_1(line: LineDriver, drive: Peer) -> None:
+def test_utilisation_is_at_most_1_if_replies_exceed_the_baud_rate(line: LineDriver, drive: Peer) -> None:
     """The whole reply comes after 0.1 ms; on a wire it would take the time of 15 characters."""
     begun = line.now
     for _ in range(100):
@@ -177,7 +177,7 @@ def line_of(seconds: float, overruns: int | None = None, **drives: Counters) -> 
     return line_statistics(seconds, drives, overruns)
 
 
-def test_the_statistics_of_a_time_span_are_a_difference_of_two_readings() -> None:
+def test_statistics_of_a_time_span_subtract_two_readings() -> None:
     one = line_of(10, 5, pump=Counters(sent=100, ideal_ns=4 * 10**9, missed=Counter({10: 3})))
     two = line_of(
         12,

@@ -180,7 +180,7 @@ def test_no_broadcast_is_sent_on_modbus_tcp() -> None:
     assert [sim.counters.broadcasts for sim in sims] == [0, 0]
 
 
-def test_every_mistake_of_a_plant_file_is_reported(tmp_path: Path) -> None:
+def test_every_modbus_tcp_mistake_in_a_plant_file_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "plant.toml"
     path.write_text(
         '[[line]]\nname = "a"\nport = "tcp://10.0.0.7"\ntransaction = "skip"\n'
@@ -230,7 +230,7 @@ def answer_when_both_asked(listening: socket.socket) -> None:
         threading.Thread(target=serve, args=[listening.accept()[0]], daemon=True).start()
 
 
-def test_two_lines_to_one_gateway_have_requests_at_the_same_time(tmp_path: Path) -> None:
+def test_two_lines_to_one_gateway_send_requests_concurrently(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as listening:
         threading.Thread(target=answer_when_both_asked, args=[listening], daemon=True).start()
         port = f"tcp://127.0.0.1:{listening.getsockname()[1]}"
@@ -240,7 +240,7 @@ def test_two_lines_to_one_gateway_have_requests_at_the_same_time(tmp_path: Path)
     assert found - {("pump-1", None), ("pump-2", None)} <= {("pump-1", 0.1), ("pump-2", 0.2)}
 
 
-def test_one_unit_id_on_two_lines_to_one_gateway_is_a_mistake(tmp_path: Path) -> None:
+def test_same_unit_id_on_two_lines_to_one_gateway_is_refused(tmp_path: Path) -> None:
     sentence = r'line "net-2", drive "pump-2": address 1 is already used by line "net-1", drive "pump-1"'
     with pytest.raises(PlantError, match=sentence):
         load_plant(plant_of_two(tmp_path / "plant.toml", "tcp://10.0.0.7", 1))
