@@ -66,20 +66,20 @@ def test_the_check_command_lists_unknown_facts_and_forbidden_writes(run: Run, fa
         assert told in refused
 
 
-def test_the_check_command_refuses_an_address_in_place_of_a_file(run: Run) -> None:
+def test_a_web_address_is_refused_as_a_plant_file(run: Run) -> None:
     told = "http://10.0.0.7:8750 is a web address, not a plant file; open a gateway's page in a "
     for command in ("check", "plan", "poll", "simulate"):
         assert run(command, "http://10.0.0.7:8750") == (2, "", f"multidrop: {told}browser\n")
 
 
-def test_the_check_command_accepts_the_name_of_a_family_that_ships_as_a_file(run: Run) -> None:
+def test_the_check_command_accepts_the_name_of_a_shipped_family_file(run: Run) -> None:
     status, out, _ = run("check", "abb-acs355")
     assert status == 0
     assert "No mistake found in abb-acs355" in words(out)
     assert max(map(len, out.splitlines())) <= 80
 
 
-def test_the_check_command_hints_at_the_right_name_or_command(run: Run, tmp_path: Path) -> None:
+def test_the_check_command_suggests_the_right_name_or_command(run: Run, tmp_path: Path) -> None:
     assert "see `multidrop models innovert-ibd`" in run("check", "innovert-ibd")[2]
     assert "did you mean abb-acs355" in run("check", "abb-acs35")[2]
     (tmp_path / "plant.toml").write_text('[[line]]\nname = "L"\n')
@@ -90,7 +90,7 @@ def test_the_check_command_hints_at_the_right_name_or_command(run: Run, tmp_path
     ]
 
 
-def test_the_models_command_prints_bits_and_addresses_as_in_manuals(run: Run, tmp_path: Path) -> None:
+def test_family_sheets_show_bit_numbers_and_hex_addresses(run: Run, tmp_path: Path) -> None:
     """Bits have numbers, and registers have hex addresses. Only a family with verbs has a watchdog."""
     _, out, _ = run("check", "abb-acs355")
     assert "bit 0 READY_TO_SWITCH_ON, bit 1 READY_TO_OPERATE" in words(out)
@@ -136,7 +136,7 @@ def test_the_models_command_warns_that_a_family_file_is_not_tested(run: Run, tmp
     assert json.loads(run("models", path, "--json")[1])["declared_in"] == "meter.toml"
 
 
-def test_a_family_file_with_mistakes_makes_models_return_2(run: Run, tmp_path: Path) -> None:
+def test_the_models_command_returns_2_for_an_invalid_family_file(run: Run, tmp_path: Path) -> None:
     path = tmp_path / "fan.toml"
     path.write_text("[family]\n")
     status, _, err = run("models", path)
@@ -193,7 +193,7 @@ def test_the_check_command_does_not_ask_for_the_value_range_of_a_coil(run: Run, 
     assert "together = { coil = 20 }" in " ".join(out.split())
 
 
-def test_a_scan_with_two_family_files_that_declare_one_model_is_refused(run: Run, tmp_path: Path) -> None:
+def test_the_scan_command_refuses_two_family_files_of_the_same_model(run: Run, tmp_path: Path) -> None:
     for folder in ("a", "b"):
         (tmp_path / folder).mkdir()
         write_meter(tmp_path / folder)

@@ -209,7 +209,7 @@ def test_the_file_name_of_a_report_must_end_in_html(run: Run, tmp_path: Path) ->
         ("a", "plant.toml", "--ports plant.toml is a file: name a directory; it is created if missing"),
     ],
 )
-def test_a_port_that_cannot_be_linked_is_refused(
+def test_the_simulate_command_reports_unusable_names_for_port_links(
     run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str, ports: str, sentence: str
 ) -> None:
     drive = '[[line.drive]]\nname = "a"\naddress = 1\nmodel = "yd1000"\n'
@@ -277,7 +277,9 @@ def test_forbidden_writes_print_a_sentence_and_return_1(run: Run, words: list[st
         ),
     ],
 )
-def test_a_forbidden_write_names_the_right_command_or_option(run: Run, words: list[str], advice: str) -> None:
+def test_the_error_for_a_forbidden_write_suggests_a_command_or_option(
+    run: Run, words: list[str], advice: str
+) -> None:
     status, out, err = run(*words)
     assert (status, out) == (1, "")
     assert advice in err
@@ -294,7 +296,7 @@ def test_advice_for_a_drive_in_a_plant_refers_to_the_plant_file(run: Run, tmp_pa
     assert "maximum frequency: write maximum_frequency = HZ below its [[line.drive]]" in err
 
 
-def test_the_advice_for_programs_is_converted_for_the_command_line() -> None:
+def test_error_advice_names_a_command_instead_of_a_python_method() -> None:
     reset = WriteForbidden(
         "x has a fault: remove its cause, then call reset_fault()", advice=Advice.call("reset_fault")
     )
@@ -307,7 +309,7 @@ def test_the_advice_for_programs_is_converted_for_the_command_line() -> None:
     assert WriteForbidden("use emergency_stop()").for_command_line() == "use emergency_stop()"
 
 
-def test_each_kind_of_advice_in_errors_has_a_command_that_replaces_it() -> None:
+def test_every_kind_of_error_advice_has_a_command_or_option() -> None:
     """The command line replaces advice for programs, such as reset_fault(), by a command or an option."""
     erman, che, ibd = ErmanERG220(1), InvtCHE(1), InnovertIBD(1)
     answers = {"last_fault": 64, "status": 4, "setpoint": 0.0, "frequency_setpoint": 0.0}
@@ -332,7 +334,7 @@ def test_unusable_ports_print_a_sentence_and_return_1(run: Run, port: str, sente
     assert run("read", port, TOY, 1) == (1, "", f"multidrop: {sentence}\n")
 
 
-def test_a_command_can_run_in_a_thread_and_keeps_signal_handlers(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_command_in_a_thread_changes_no_signal_handlers(capsys: pytest.CaptureFixture[str]) -> None:
     """Only the main thread can change signal handlers, so a command in another thread must not try."""
     found: list[int] = []
     before = signal.getsignal(signal.SIGTERM)
@@ -385,7 +387,7 @@ def test_a_closed_standard_stream_causes_no_traceback(closed: int, words: list[s
 
 @pytest.mark.slow
 @pytest.mark.parametrize("closed", [0, 1, 2])
-def test_no_file_gets_the_descriptor_of_a_closed_stream(closed: int) -> None:
+def test_the_descriptor_of_a_closed_output_stream_is_not_reused(closed: int) -> None:
     """A serial port with that descriptor would receive the printed output."""
     code = (
         "import os, multidrop.cli as cli; cli.main(['--version']); os._exit(os.open(os.devnull, os.O_RDONLY))"

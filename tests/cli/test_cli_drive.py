@@ -59,7 +59,7 @@ def test_the_read_command_prints_all_readings_and_settings_with_units(run: Run, 
         ({"LC_MESSAGES": "ru_RU", "LC_ALL": "en_US"}, ""),
     ],
 )
-def test_the_titles_are_printed_in_the_language_of_the_environment(
+def test_register_titles_are_printed_in_the_users_language(
     run: Run, port: str, monkeypatch: pytest.MonkeyPatch, variables: dict[str, str], title: str
 ) -> None:
     monkeypatch.delenv("LC_ALL")
@@ -133,7 +133,9 @@ class Mute(Drive):
 """
 
 
-def test_a_stop_needs_no_readable_state(run: Run, port: str, toy: SimulatedDrive, tmp_path: Path) -> None:
+def test_a_drive_with_an_unreadable_state_can_be_stopped(
+    run: Run, port: str, toy: SimulatedDrive, tmp_path: Path
+) -> None:
     (tmp_path / "mute.py").write_text(MUTE)
     words = ("stop", port, f"{tmp_path}/mute.py:Mute", 1)
     status, out, err = run(*words)
@@ -162,7 +164,7 @@ def test_the_write_command_prints_its_outcome_on_one_line(run: Run, port: str, t
     assert toy["frequency"] == 25
 
 
-def test_a_write_for_a_stopped_motor_fails_while_it_runs(run: Run, port: str, toy: SimulatedDrive) -> None:
+def test_a_standstill_only_write_fails_while_the_motor_runs(run: Run, port: str, toy: SimulatedDrive) -> None:
     status, out, err = run("write", port, TOY, 1, "acceleration_time", "12.5", "--yes")
     assert (status, out) == (1, "")
     assert "acceleration_time of toy@1 is not written: it can be written only at standstill" in err
@@ -180,7 +182,7 @@ def test_the_write_command_prints_its_outcome_as_json(run: Run, port: str) -> No
     }
 
 
-def test_a_clamped_value_is_reported_with_status_1(run: Run, port: str) -> None:
+def test_the_write_command_returns_1_if_the_drive_clamps_the_value(run: Run, port: str) -> None:
     assert run("write", port, TOY, 2, "acceleration_time", "30", "--yes") == (
         1,
         "",
@@ -196,7 +198,9 @@ def test_a_rounding_error_of_a_calculated_value_is_not_reported(capsys: pytest.C
     assert "24.0099998 becomes 24.01 %" in capsys.readouterr().err
 
 
-def test_a_value_between_two_steps_is_rounded_with_warning(run: Run, port: str, toy: SimulatedDrive) -> None:
+def test_a_value_finer_than_the_register_step_is_rounded_with_a_warning(
+    run: Run, port: str, toy: SimulatedDrive
+) -> None:
     """The rounded value is sent to the drive and reported to the user."""
     note = "multidrop: frequency has steps of 0.01 Hz: 12.345 becomes 12.34 Hz\n"
     assert run("write", port, TOY, 1, "frequency", "12.345", "--yes") == (
@@ -218,7 +222,7 @@ def test_a_value_between_two_steps_is_rounded_with_warning(run: Run, port: str, 
     assert f"{note}multidrop: Write frequency = 12.34 Hz to toy@1" in err
 
 
-def test_a_setpoint_written_in_percent_is_shown_in_percent(run: Run) -> None:
+def test_set_frequency_prints_the_setpoint_in_the_registers_unit(run: Run) -> None:
     che = InvtCHE(1, maximum_frequency=50)
     with Simulator([Wire([simulated(che)], unpaced=True)]) as simulator:
         words = ("invt-che", 1, "12.3456", "--option", "maximum_frequency=50", "--yes")
@@ -243,7 +247,7 @@ def test_the_commands_start_stop_and_set_frequency_write_to_the_drive(
 
 
 @pytest.mark.slow
-def test_a_start_of_a_drive_with_unreadable_setpoint_needs_a_frequency(run: Run) -> None:
+def test_start_needs_a_frequency_if_the_setpoint_is_unreadable(run: Run) -> None:
     """A command does not know the setpoint that an earlier command has written."""
     with Simulator([Wire([simulated(InnovertIBD(1))], unpaced=True)]) as simulator:
         words = (simulator.wires[0].path, "innovert-ibd", 1, "--yes")
@@ -259,7 +263,9 @@ def test_the_start_command_writes_the_setpoint_first(run: Run, port: str, toy: S
 
 
 @pytest.mark.parametrize("at", ["opening", "setpoint", "reading"])
-def test_a_suspended_process_sends_no_start(run: Run, monkeypatch: pytest.MonkeyPatch, at: str) -> None:
+def test_the_start_command_sends_no_start_after_a_suspension(
+    run: Run, monkeypatch: pytest.MonkeyPatch, at: str
+) -> None:
     """The user may press Ctrl-Z during the command, and continue it hours later."""
     sim = simulated(InvtCHE(1, maximum_frequency=50))
     assert isinstance(sim, MotorDrive)
@@ -285,7 +291,7 @@ def test_a_suspended_process_sends_no_start(run: Run, monkeypatch: pytest.Monkey
 
 @patient
 @pytest.mark.parametrize(("answer", "writes"), [("y", 1), ("yes", 1), ("n", 0), ("", 0), ("start", 0)])
-def test_a_start_is_confirmed_on_a_terminal_or_not_sent(
+def test_the_start_command_needs_a_yes_on_a_terminal(
     run: Run, port: str, toy: SimulatedDrive, monkeypatch: pytest.MonkeyPatch, answer: str, writes: int
 ) -> None:
     terminal = io.StringIO(answer + "\n")
@@ -297,7 +303,7 @@ def test_a_start_is_confirmed_on_a_terminal_or_not_sent(
     assert len(toy.counters.writes) == writes
 
 
-def test_an_input_typed_before_the_question_does_not_answer_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_input_typed_before_a_question_is_ignored(monkeypatch: pytest.MonkeyPatch) -> None:
     """An impatient user may have typed a second "y" as an answer to the previous question."""
     terminal, program = os.openpty()
 
@@ -389,7 +395,7 @@ def test_the_commands_state_and_read_send_no_write(run: Run, port: str, toy: Sim
     assert not toy.counters.writes
 
 
-def test_the_state_command_is_printed_in_words_and_as_json(run: Run, port: str) -> None:
+def test_the_state_command_prints_words_or_json(run: Run, port: str) -> None:
     assert run("state", port, TOY, 1) == (0, f"running\n{DOG}\n", "")
     _, out, _ = run("state", port, TOY, 1, "--json")
     assert json.loads(out)["state"] == {"condition": "running", "direction": None, "fault": None, "note": ""}

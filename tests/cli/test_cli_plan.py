@@ -41,9 +41,7 @@ def crowded(tmp_path: Path) -> Path:
     return path
 
 
-def test_the_plan_command_prints_the_rates_and_returns_0_if_the_line_can_reach_them(
-    run: Run, fitting: Path
-) -> None:
+def test_the_plan_command_returns_0_if_the_line_reaches_all_rates(run: Run, fitting: Path) -> None:
     status, out, err = run("plan", fitting)
     assert (status, err) == (0, "")
     lines = out.splitlines()
@@ -102,9 +100,7 @@ def test_the_plan_command_prints_the_same_figures_as_json(run: Run, fitting: Pat
 
 
 @pytest.mark.slow
-def test_the_plan_command_prints_suggestions_and_returns_1_if_the_line_is_too_slow(
-    run: Run, crowded: Path
-) -> None:
+def test_the_plan_command_suggests_changes_if_the_line_is_too_slow(run: Run, crowded: Path) -> None:
     status, out, err = run("plan", crowded)
     assert (status, err) == (1, "")
     assert max(map(len, out.splitlines())) <= 80
@@ -124,7 +120,7 @@ def test_the_plan_command_prints_suggestions_and_returns_1_if_the_line_is_too_sl
     assert run("plan", crowded)[0] == 0
 
 
-def test_a_drive_without_a_rate_gets_time_on_an_overloaded_line(run: Run, crowded: Path) -> None:
+def test_the_plan_polls_a_drive_without_a_rate_on_an_overloaded_line(run: Run, crowded: Path) -> None:
     crowded.write_text(crowded.read_text() + DRIVE.format("eager", TOY, 9) + 'poll = ["fault"]\n')
     status, out, _ = run("plan", crowded)
     assert status == 1

@@ -118,7 +118,9 @@ def test_a_command_uses_the_settings_in_the_plant_file(run: Run, plant: Path, at
         ),
     ],
 )
-def test_a_mistaken_name_or_option_is_shown(run: Run, plant: Path, words: list[str], sentence: str) -> None:
+def test_a_wrong_drive_name_or_option_is_reported_in_one_sentence(
+    run: Run, plant: Path, words: list[str], sentence: str
+) -> None:
     status, out, err = run("read", plant, *words)
     assert (status, out) == (2, "")
     assert err.startswith(f"multidrop: {sentence.replace('PLANT', str(plant))}")
@@ -133,7 +135,7 @@ def test_options_for_plant_files_are_refused_without_a_plant_file(run: Run) -> N
         assert run(*words, "--port=a=b") == (2, "", sentence)
 
 
-def test_the_read_command_reports_plant_file_errors_as_the_plan_command_does(run: Run, plant: Path) -> None:
+def test_the_commands_read_and_plan_report_the_same_plant_file_errors(run: Run, plant: Path) -> None:
     plant.write_text(
         plant.read_text().replace('"pump-1"', '"fan-1"').replace("address = 4", "address = 4000")
     )
@@ -157,7 +159,7 @@ def test_the_write_command_accepts_plant_file_and_drive_name(
     assert toy["frequency"] == 25
 
 
-def test_each_verb_accepts_a_plant_file_and_a_drive_name(
+def test_drive_commands_accept_a_plant_file_and_a_drive_name(
     run: Run, plant: Path, at: str, toy: SimulatedDrive
 ) -> None:
     drive = (plant, "pump-1", at)
@@ -174,7 +176,9 @@ def test_each_verb_accepts_a_plant_file_and_a_drive_name(
     assert toy["control"] == 0
 
 
-def test_only_stops_accept_other_spellings(run: Run, tmp_path: Path, port: str, toy: SimulatedDrive) -> None:
+def test_start_and_write_refuse_a_drive_name_in_another_unicode_form(
+    run: Run, tmp_path: Path, port: str, toy: SimulatedDrive
+) -> None:
     """Depending on the keyboard, a u with two dots is one character (U+00FC) or two (U+0075 U+0308)."""
     plant = tmp_path / "spelt.toml"
     text = LINE.format("hall-1", port) + DRIVE.format("L\u00fcfter", TOY, 1)
@@ -192,13 +196,15 @@ def test_only_stops_accept_other_spellings(run: Run, tmp_path: Path, port: str, 
     assert run("read", *fan, "output_current")[0] == 0
 
 
-def test_a_start_by_plant_file_needs_confirming(run: Run, plant: Path, at: str, toy: SimulatedDrive) -> None:
+def test_a_start_with_a_plant_file_needs_confirmation(
+    run: Run, plant: Path, at: str, toy: SimulatedDrive
+) -> None:
     status, _, err = run("start", plant, "pump-1", at)
     assert (status, err.startswith("multidrop: Start the motor of pump-1 on /dev/pts/")) == (1, True)
     assert not toy.counters.writes
 
 
-def test_an_unidentifiable_drive_is_commanded_only_if_confirmed(run: Run, plant: Path, at: str) -> None:
+def test_an_unidentifiable_drive_starts_only_with_the_key_confirmed(run: Run, plant: Path, at: str) -> None:
     start = ("start", plant, "fan-1", at, "--yes")
     status, _, err = run(*start)
     assert (status, "declare confirmed = 1" in err or "confirmed" in err) == (1, True)
@@ -209,7 +215,9 @@ def test_an_unidentifiable_drive_is_commanded_only_if_confirmed(run: Run, plant:
 
 
 @pytest.mark.parametrize(("there", "is_started"), [(Toy(4), False), (InvtCHE(4, maximum_frequency=50), True)])
-def test_a_start_is_not_sent_to_another_family(run: Run, plant: Path, there: Drive, is_started: bool) -> None:
+def test_no_start_is_sent_if_the_drive_is_of_another_family(
+    run: Run, plant: Path, there: Drive, is_started: bool
+) -> None:
     plant.write_text(plant.read_text().replace("address = 4\n", "address = 4\nmaximum_frequency = 50\n"))
     sim = simulated(there)
     with Simulator([Wire([sim], unpaced=True)]) as simulator:
@@ -300,7 +308,7 @@ def test_the_sniff_command_accepts_a_plant_file_and_a_line(run: Run, plant: Path
     assert "is a plant file already" in run("sniff", plant, "roof", "--plant", plant, "--seconds", "0.2")[2]
 
 
-def test_a_model_is_found_relative_to_the_plant_file(
+def test_a_model_file_path_is_relative_to_the_plant_file(
     run: Run, port: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The working directory does not matter, and a model's file may import a module beside it."""
@@ -317,7 +325,7 @@ def test_a_model_is_found_relative_to_the_plant_file(
     assert (status, out) == (0, "output_current  3.25  A\n")
 
 
-def test_a_plant_file_does_not_alter_which_writes_are_refused(
+def test_the_same_writes_are_refused_with_and_without_a_plant_file(
     run: Run, plant: Path, at: str, port: str
 ) -> None:
     """Each command names the drive first by plant file, then by port. The errors must be equal."""
@@ -363,7 +371,7 @@ def test_a_family_file_in_place_of_a_plant_file_is_refused(run: Run, tmp_path: P
 
 
 @pytest.mark.parametrize("words", [[], ["--all"], ["--line", "hall-1"]])
-def test_a_stop_of_a_plant_or_line_stops_all_its_drives(
+def test_the_stop_command_stops_all_drives_of_a_plant_or_line(
     run: Run, plant: Path, at: str, toy: SimulatedDrive, words: list[str]
 ) -> None:
     toy["control"] = Status.RUNNING
@@ -377,7 +385,9 @@ def test_a_stop_of_a_plant_or_line_stops_all_its_drives(
     assert status == has_portless_line
 
 
-def test_a_stop_of_a_plant_prints_json(run: Run, tmp_path: Path, port: str, toy: SimulatedDrive) -> None:
+def test_the_stop_command_for_a_whole_plant_prints_json(
+    run: Run, tmp_path: Path, port: str, toy: SimulatedDrive
+) -> None:
     plant = tmp_path / "all.toml"
     drives = DRIVE.format("pump-1", TOY, 1) + DRIVE.format("pump-4", TOY, 4)
     plant.write_text(LINE.format("hall-1", port) + drives)
@@ -419,7 +429,7 @@ MISTAKES = [
 
 @pytest.mark.parametrize("words", [[], ["pump-1"]])
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_drive_can_be_stopped_although_another_drive_in_the_plant_file_has_a_mistake(
+def test_a_drive_can_be_stopped_despite_a_mistake_elsewhere_in_the_plant_file(
     run: Run, tmp_path: Path, port: str, toy: SimulatedDrive, mistake: str, words: list[str]
 ) -> None:
     plant = tmp_path / "wrong.toml"
@@ -434,7 +444,7 @@ def test_a_drive_can_be_stopped_although_another_drive_in_the_plant_file_has_a_m
 
 
 @pytest.mark.parametrize("mistake", ['poll = ["output_curent"]\n', 'every = "soon"\n'])
-def test_a_drive_can_be_stopped_although_its_polled_registers_have_a_mistake(
+def test_a_drive_can_be_stopped_despite_a_mistake_in_the_poll_settings(
     run: Run, tmp_path: Path, port: str, toy: SimulatedDrive, mistake: str
 ) -> None:
     plant = tmp_path / "wrong.toml"
@@ -444,7 +454,9 @@ def test_a_drive_can_be_stopped_although_its_polled_registers_have_a_mistake(
     assert toy["control"] == 0
 
 
-def test_a_drive_with_a_mistake_in_its_own_table_is_not_stopped(run: Run, tmp_path: Path, port: str) -> None:
+def test_a_stop_is_not_sent_if_the_drives_own_table_has_a_mistake(
+    run: Run, tmp_path: Path, port: str
+) -> None:
     plant = tmp_path / "wrong.toml"
     drives = DRIVE.format("pump-1", TOY, 1) + DRIVE.format("fan-9", "no-such-model", 9)
     plant.write_text(LINE.format("hall-1", port) + drives)

@@ -60,9 +60,7 @@ def test_the_poll_command_can_request_realtime_scheduling(
 
 @pytest.mark.long
 @pytest.mark.parametrize("number", usually(signal.SIGINT, signal.SIGTERM))
-def test_the_simulate_command_runs_until_interrupted_and_removes_its_links(
-    tmp_path: Path, number: int
-) -> None:
+def test_the_simulate_command_removes_its_port_links_when_interrupted(tmp_path: Path, number: int) -> None:
     link = tmp_path / "ports" / "hall-1"
     with running("simulate", plant_file(tmp_path), "--ports", tmp_path / "ports") as (process, out):
         out.readline()
@@ -72,7 +70,7 @@ def test_the_simulate_command_runs_until_interrupted_and_removes_its_links(
     assert not link.is_symlink()
 
 
-def test_the_simulate_command_does_not_replace_a_file_by_a_link(run: Run, tmp_path: Path) -> None:
+def test_the_simulate_command_never_replaces_an_existing_file(run: Run, tmp_path: Path) -> None:
     link = tmp_path / "ports" / "hall-1"
     link.parent.mkdir()
     link.write_text("mine")
@@ -108,7 +106,7 @@ def test_the_simulate_command_applies_the_faults_of_its_file(tmp_path: Path) -> 
 
 
 @pytest.mark.long
-def test_the_poll_command_records_segments_and_continues_after_a_restart(
+def test_the_poll_command_continues_a_segmented_recording_after_a_restart(
     run: Run, plant: Path, tmp_path: Path
 ) -> None:
     counted = 0
@@ -261,7 +259,7 @@ def test_the_poll_summary_compares_predicted_and_measured_rates_as_text(run: Run
 
 
 @pytest.mark.slow
-def test_the_poll_command_prints_prediction_and_measurement_side_by_side(run: Run, plant: Path) -> None:
+def test_the_json_summary_of_poll_compares_prediction_and_measurement(run: Run, plant: Path) -> None:
     summary = json.loads(run("poll", plant, "--seconds", 0.5, "--json")[1])["lines"]["hall-1"]
     found = summary["comparison"]
     planned = json.loads(run("plan", plant, "--json")[1])["lines"]["hall-1"]
@@ -430,7 +428,7 @@ def framings_of(model: str) -> list[str]:
 
 
 @pytest.mark.slow
-def test_the_operator_of_a_demo_never_undoes_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_demos_simulated_operator_never_restarts_a_stopped_motor(monkeypatch: pytest.MonkeyPatch) -> None:
     """The operator skips a silent drive, and restarts a motor after a trip."""
     monkeypatch.setattr(demo_plant, "STEP_S", 0.05)
     sims: list[Any] = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2, 3)]
@@ -446,7 +444,7 @@ def test_the_operator_of_a_demo_never_undoes_a_stop(monkeypatch: pytest.MonkeyPa
             assert not stopped.energised
 
 
-def test_a_demo_replaces_only_the_recording_of_a_demo(run: Run, tmp_path: Path) -> None:
+def test_a_demo_overwrites_only_recordings_of_earlier_demos(run: Run, tmp_path: Path) -> None:
     out = tmp_path / "demo.arrows"
     with open_writer(out, {"drives": {"pump-1": {}}}):
         pass
@@ -487,7 +485,7 @@ def test_the_poll_command_records_each_trigger_in_its_own_file(run: Run, plant: 
 
 
 @pytest.mark.slow
-def test_the_poll_command_records_a_fault_and_a_changed_value(run: Run, tmp_path: Path) -> None:
+def test_the_poll_command_records_two_triggers_for_one_fault(run: Run, tmp_path: Path) -> None:
     """The simulated drive trips once after 30 requests. Nothing else changes, so there are two triggers."""
     with simulated_test(write_test(tmp_path)) as (_, (fan,)):
         answer = fan.answer

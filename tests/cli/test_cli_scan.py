@@ -115,7 +115,7 @@ def test_a_scan_without_findings_returns_1_and_writes_no_file(run: Run, port: st
 
 @pytest.mark.long
 @pytest.mark.parametrize("port", ["socket://127.0.0.1:0"], indirect=True)
-def test_a_scan_of_a_serial_server_needs_its_baud_rate(run: Run, port: str) -> None:
+def test_a_scan_over_a_serial_server_needs_the_baud_rate(run: Run, port: str) -> None:
     status, _, err = run("scan", port, "--quick")
     assert status == 2
     assert "Give the server's rate, such as --baudrates 9600" in err
@@ -125,7 +125,7 @@ def test_a_scan_of_a_serial_server_needs_its_baud_rate(run: Run, port: str) -> N
     assert "address 2: innovert-ibd" in out
 
 
-def test_unit_ids_above_the_addresses_of_serial_lines_are_scanned_on_tcp(run: Run, tmp_path: Path) -> None:
+def test_a_scan_over_tcp_finds_the_unit_ids_0_and_255(run: Run, tmp_path: Path) -> None:
     model = tmp_path / "meter.toml"
     model.write_text(
         '[family]\ntitle = "T"\nmanual = "M"\ncounts_from = 0\naddresses = [0, 255]\n'
@@ -177,14 +177,16 @@ def test_an_unknown_device_on_modbus_tcp_is_listed_once_without_a_baud_rate(run:
         (("--model", "inovert-ibd"), "did you mean innovert-ibd"),
     ],
 )
-def test_a_mistaken_scan_argument_is_named(run: Run, words: tuple[str, ...], sentence: str) -> None:
+def test_an_invalid_scan_argument_is_named_in_the_error(
+    run: Run, words: tuple[str, ...], sentence: str
+) -> None:
     status, out, err = run("scan", "/dev/nowhere", *words)
     assert (status, out) == (2, "")
     assert sentence in err
     assert len(err.splitlines()) == 1
 
 
-def test_an_unwritable_plant_file_fails_before_the_port_is_opened(run: Run, tmp_path: Path) -> None:
+def test_a_scan_into_an_unwritable_file_fails_before_the_port_opens(run: Run, tmp_path: Path) -> None:
     for out, status, reason in (
         (tmp_path / "none" / "found.toml", 2, "No such file or directory"),
         (tmp_path, 2, "Is a directory"),
@@ -239,7 +241,7 @@ def test_each_doubt_about_a_found_drive_is_a_comment_in_the_plant_file(tmp_path:
     assert comments[-1] == "# address 4: an unknown Modbus device at 9600 8N1 rtu"
 
 
-def test_a_plant_file_is_not_written_without_a_drive() -> None:
+def test_no_plant_file_is_written_if_a_scan_identifies_no_drive() -> None:
     with pytest.raises(ValueError, match="so no plant file can be written"):
         plant_text("port", [Found(4, USUAL, Framing.RTU, (), 0.005)], {})
 
@@ -260,7 +262,7 @@ def test_an_interrupted_scan_keeps_its_findings(
     assert json.loads(out)["finished"] is False if words else "1 drive found" in out
 
 
-def test_the_plant_file_of_a_scan_has_the_port_name_with_the_adapters_serial_number(
+def test_a_scan_writes_the_port_name_with_the_adapters_serial_number(
     run: Run, port: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     by_id = tmp_path / "usb-FTDI_A50285BI-if00-port0"
@@ -400,7 +402,7 @@ def test_the_ports_command_prints_the_group_that_may_open_a_port(
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="permissions of POSIX")
-def test_permission_advice_is_given_to_a_user_without_a_name(
+def test_permission_advice_works_for_a_user_id_without_an_account(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     port = tmp_path / "ttyUSB0"
@@ -439,9 +441,7 @@ def test_the_simulate_command_serves_a_line_of_a_plant_over_modbus_tcp(tmp_path:
 
 
 @pytest.mark.long
-def test_the_simulate_command_serves_a_local_port_under_its_name_in_the_file(
-    tmp_path: Path, run: Run
-) -> None:
+def test_the_simulate_command_listens_on_a_local_port_of_the_plant_file(tmp_path: Path, run: Run) -> None:
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = f"tcp://127.0.0.1:{free.getsockname()[1]}"
     plant = tmp_path / "plant.toml"
@@ -451,7 +451,7 @@ def test_the_simulate_command_serves_a_local_port_under_its_name_in_the_file(
         assert "output_current" in run("read", plant, "pump", "output_current")[1]
 
 
-def test_a_simulated_serial_line_needs_a_directory_for_its_port(tmp_path: Path, run: Run) -> None:
+def test_the_simulate_command_needs_a_ports_directory_for_a_serial_line(tmp_path: Path, run: Run) -> None:
     plant = tmp_path / "plant.toml"
     plant.write_text(PLANT.format(port="/dev/ttyUSB0"))
     assert run("simulate", plant)[::2] == (

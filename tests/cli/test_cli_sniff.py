@@ -181,7 +181,7 @@ class ResponderLine:
 @pytest.mark.long
 @pytest.mark.parametrize("kind", ["socket", "rfc2217"])
 @pyserials_own
-def test_a_network_line_is_sniffed_without_sending(run: Run, kind: str) -> None:
+def test_the_sniff_command_sends_no_bytes_to_a_network_port(run: Run, kind: str) -> None:
     far = ResponderLine(READ.request_frame + READ.frame + WRITE.request_frame + WRITE.frame)
     server = SerialServer(far.url) if kind == "rfc2217" else None
     url = server.url if server else far.url
@@ -200,7 +200,7 @@ def test_a_network_line_is_sniffed_without_sending(run: Run, kind: str) -> None:
     assert far.close() == b""
 
 
-def test_a_sniffed_url_cannot_be_written_to() -> None:
+def test_a_listener_on_a_network_port_cannot_send() -> None:
     far = ResponderLine(b"")
     with closing(Listener(far.url, Settings(9600, "8N1"))) as listener:
         port = listener._source
@@ -336,7 +336,7 @@ class Meter(Drive):
 """
 
 
-def test_a_reply_that_is_nan_is_printed_as_no_valid_value(run: Run, tmp_path: Path) -> None:
+def test_a_nan_reply_is_printed_as_no_valid_value(run: Run, tmp_path: Path) -> None:
     """A meter without a sensor replies with the NaN of the floating-point format."""
     (tmp_path / "meter.py").write_text(METER)
     drive = 'name = "meter"\nmodel = "meter.py:Meter"\naddress = 1\n'

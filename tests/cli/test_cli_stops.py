@@ -85,7 +85,7 @@ def pressed_at(place: str, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("place", "told"), [("__init__", "the start was not sent"), ("close", "start is done")]
 )
-def test_ctrl_c_while_a_port_opens_or_closes_reports_the_start(
+def test_ctrl_c_while_a_port_opens_or_closes_says_if_the_start_was_sent(
     run: Run, che: Che, monkeypatch: pytest.MonkeyPatch, place: str, told: str
 ) -> None:
     received, words = che
@@ -108,7 +108,7 @@ def test_ctrl_c_while_a_port_opens_or_closes_reports_the_start(
         ),
     ],
 )
-def test_ctrl_c_while_a_port_opens_or_closes_reports_the_write(
+def test_ctrl_c_while_a_port_opens_or_closes_says_if_the_write_was_sent(
     run: Run,
     port: str,
     toy: SimulatedDrive,
@@ -174,7 +174,9 @@ def test_a_stop_continues_after_its_terminal_was_closed(run: Run, che: Che, verb
         (["pump-2"], ["stop takes one drive, which is invt-che@1: ignored pump-2"]),
     ],
 )
-def test_a_mistaken_option_prevents_no_stop(run: Run, che: Che, mistake: list[str], told: list[str]) -> None:
+def test_a_stop_is_sent_despite_an_invalid_option(
+    run: Run, che: Che, mistake: list[str], told: list[str]
+) -> None:
     received, words = che
     assert run("start", *words, "--frequency", 20, "--yes")[0] == 0
     begun = len(received.writes)
@@ -188,7 +190,7 @@ def test_a_mistaken_option_prevents_no_stop(run: Run, che: Che, mistake: list[st
 
 
 @patient
-def test_the_value_of_an_unknown_option_is_not_taken_for_a_drive(run: Run, che: Che) -> None:
+def test_the_stop_command_ignores_an_unknown_option_with_a_value(run: Run, che: Che) -> None:
     received, (port, model, address, option) = che
     status, out, err = run("stop", port, model, "--secnds", 5, address, option)
     assert status == 2
@@ -203,7 +205,9 @@ def test_the_value_of_an_unknown_option_is_not_taken_for_a_drive(run: Run, che: 
 
 
 @patient
-def test_a_stop_is_sent_if_its_terminal_closes(run: Run, che: Che, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_is_sent_if_the_terminal_closes_before_parsing(
+    run: Run, che: Che, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The terminal closes before the arguments are parsed, which takes a while on a small computer."""
 
     def parse(*words: Any) -> Any:
@@ -227,7 +231,7 @@ def test_a_stop_is_sent_if_its_terminal_closes(run: Run, che: Che, monkeypatch: 
     "words",
     [["nowhere", "invt-che"], ["nowhere", "invt-che", "one"], ["nowhere", "invt-che", 1, "--baudrate"]],
 )
-def test_a_stop_that_names_no_drive_is_reported_as_not_sent(run: Run, words: list[object]) -> None:
+def test_a_stop_command_without_a_valid_drive_is_reported_as_not_sent(run: Run, words: list[object]) -> None:
     status, _, err = run("emergency-stop", *words)
     assert status == 2
     assert err.startswith("multidrop: the emergency-stop was NOT sent: ")
@@ -268,7 +272,7 @@ def test_the_monitor_completes_a_stop_after_its_terminal_was_closed(
 
 @pytest.mark.long
 @patient
-def test_the_monitor_ends_without_writing_when_its_terminal_is_closed(che: Che, tmp_path: Path) -> None:
+def test_a_closed_terminal_ends_the_monitor_without_a_write(che: Che, tmp_path: Path) -> None:
     received, words = che
     plant = plant_of(words[0], tmp_path)
     with closing_terminal("monitor", plant) as terminal:

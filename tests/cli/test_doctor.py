@@ -66,14 +66,14 @@ def test_the_doctor_command_reports_no_adapter_on_a_pty(run: Run, port: str) -> 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("port", ["socket://127.0.0.1:0"], indirect=True)
-def test_the_doctor_command_says_that_the_adapter_of_a_socket_is_at_the_far_end(run: Run, port: str) -> None:
+def test_the_doctor_command_reports_a_remote_adapter_for_a_network_port(run: Run, port: str) -> None:
     status, told = examined(run, port)
     assert status == 0
     assert "is a TCP connection" in told
     assert "at the far end" in told
 
 
-def test_an_rs485_mode_is_accepted_only_for_a_device(run: Run, port: str) -> None:
+def test_the_rs485_option_is_accepted_only_for_a_serial_device(run: Run, port: str) -> None:
     status, out, err = run("doctor", port, "--rs485", "rts-up")
     assert (status, err) == (0, "")  # a pseudo-terminal has no RS-485 mode, and needs none
     for words, sentence in (
@@ -88,9 +88,7 @@ def test_an_rs485_mode_is_accepted_only_for_a_device(run: Run, port: str) -> Non
 @pytest.mark.slow
 @pyserials_own
 @pytest.mark.parametrize("port", ["socket://127.0.0.1:0"], indirect=True)
-def test_the_doctor_command_says_that_the_adapter_of_a_pyserial_port_is_at_the_far_end(
-    run: Run, port: str
-) -> None:
+def test_the_doctor_command_reports_a_remote_adapter_for_a_pyserial_url(run: Run, port: str) -> None:
     server = SerialServer(port)
     status, out, _ = run("doctor", server.url)
     server.close()
@@ -227,7 +225,9 @@ def responder() -> Iterator[Callable[[Callable[[bytes], bytes]], Responder]]:
 
 
 @pytest.mark.slow
-def test_the_echo_test_ignores_exceptions(run: Run, responder: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_echo_test_ignores_exception_replies(
+    run: Run, responder: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A server may answer for every address, even an unused one."""
     # on a busy machine, the reply may come late
     monkeypatch.setattr("multidrop.cli.doctor.LEAST_TIMEOUT", 2.0)
@@ -239,7 +239,9 @@ def test_the_echo_test_ignores_exceptions(run: Run, responder: Any, monkeypatch:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("code", [0x0A, 0x0B])
-def test_an_exception_from_a_gateway_is_not_the_drives_reply(run: Run, responder: Any, code: int) -> None:
+def test_an_exception_from_a_gateway_does_not_count_as_a_drives_reply(
+    run: Run, responder: Any, code: int
+) -> None:
     """These codes mean that the device was not reached (application protocol V1.1b3, section 7)."""
     end = responder(lambda request: build_reply(Framing.RTU, Message(request[0], request[1], exception=code)))
     status, told = examined(run, end.path, *CHE_9)
@@ -248,7 +250,9 @@ def test_an_exception_from_a_gateway_is_not_the_drives_reply(run: Run, responder
 
 
 @pytest.mark.slow
-def test_an_exception_reply_shows_the_framing_of_a_gateway(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_framing_of_a_gateway_is_detected_by_an_exception_reply(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Bytes without a frame do not prove that the far end speaks the other framing."""
     monkeypatch.setattr(doctor, "MOST_S", 1.0)
     monkeypatch.setattr(doctor.ask_once, "__defaults__", (RS485.OFF, 0.5))
@@ -306,7 +310,7 @@ def test_the_doctor_command_counts_only_sent_requests(
         (("/dev/nowhere", "--framing", "rtu"), 2, "--framing needs a drive: add --model and --address"),
     ],
 )
-def test_wrong_arguments_are_named_in_the_error(
+def test_invalid_doctor_arguments_are_named_in_the_error(
     run: Run, words: tuple[str, ...], status: int, sentence: str
 ) -> None:
     found, out, err = run("doctor", *words)
@@ -317,7 +321,7 @@ def test_wrong_arguments_are_named_in_the_error(
 
 @pytest.mark.long
 @pytest.mark.parametrize("port", ["tcp://127.0.0.1:0"], indirect=True)
-def test_a_drive_on_modbus_tcp_is_measured(port: str, run: Run) -> None:
+def test_the_doctor_command_measures_a_drive_on_modbus_tcp(port: str, run: Run) -> None:
     status, told = examined(run, port, *CHE_1)
     assert status == 0
     assert "is a Modbus TCP connection" in told
@@ -334,7 +338,7 @@ def test_a_drive_on_modbus_tcp_is_measured(port: str, run: Run) -> None:
     ),
     indirect=["port"],
 )
-def test_the_doctor_command_reports_the_other_framing(
+def test_the_doctor_command_suggests_the_framing_that_the_far_end_uses(
     port: str, asked: str, spoken: str, other: str, run: Run
 ) -> None:
     place = port.partition("://")[2]
@@ -345,7 +349,7 @@ def test_the_doctor_command_reports_the_other_framing(
 
 
 @pytest.mark.parametrize("table_of", ["setting", "command"], ids=["readable", "unreadable"])
-def test_a_family_without_readings_is_measured_with_another_register(
+def test_the_doctor_command_reads_another_register_without_readings(
     run: Run, tmp_path: Path, table_of: str
 ) -> None:
     family = tmp_path / "relay.toml"

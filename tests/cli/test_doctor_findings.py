@@ -81,7 +81,7 @@ def test_an_adapter_is_found_through_sysfs(sysfs: Path, is_link: bool) -> None:
     assert (adapter.usb_id, adapter.latency_timer) == ("0403:6001", 16)
 
 
-def test_an_adapter_without_known_facts_has_only_a_name(sysfs: Path) -> None:
+def test_an_adapter_unknown_to_sysfs_has_only_a_name(sysfs: Path) -> None:
     assert find_adapter("/dev/ttyS7", sysfs) == Adapter("ttyS7")
 
 
@@ -104,7 +104,7 @@ def test_a_pty_has_no_low_latency_flag_and_no_rs485_mode() -> None:
 
 
 @pytest.mark.parametrize(("settable", "mode"), [(True, RS485Mode(False, False)), (False, None)])
-def test_a_driver_that_refuses_the_rs485_mode_counts_as_having_none(
+def test_the_rs485_mode_is_none_if_the_driver_refuses_the_ioctl(
     monkeypatch: pytest.MonkeyPatch, settable: bool, mode: RS485Mode | None
 ) -> None:
     """In the driver serial8250, for instance, TIOCGRS485 returns zeros and TIOCSRS485 fails with ENOTTY."""
@@ -122,7 +122,7 @@ def test_a_driver_that_refuses_the_rs485_mode_counts_as_having_none(
     assert written == [bytes(32)] * settable
 
 
-def test_a_lost_port_raises_an_error_when_its_driver_is_examined() -> None:
+def test_reading_driver_settings_of_a_lost_port_raises_oserror() -> None:
     master, slave = os.openpty()
     os.close(master)
     os.close(slave)
@@ -241,14 +241,14 @@ def test_the_doctor_command_reports_lost_requests_as_a_failure_with_advice() -> 
     assert lost.is_failure
 
 
-def test_invalid_replies_are_part_of_the_round_trip_finding() -> None:
+def test_the_round_trip_finding_shows_an_invalid_reply() -> None:
     came = "reply from another address (received 63 03 02 00 00)"
     nothing_good = round_trip_finding(InvtCHE(1), [], 4, came=came).what
     assert nothing_good == f"invt-che@1 gave no valid reply to 4 requests; received: {came}"
     assert round_trip_finding(InvtCHE(1), [0.005], 2, came=came).what.endswith(f"received instead: {came}")
 
 
-def test_a_round_trip_over_a_network_includes_the_wires_time() -> None:
+def test_the_round_trip_over_a_network_states_the_time_on_the_wire() -> None:
     told = round_trip_finding(InvtCHE(1), [0.0004, 0.0005, 0.0006], 3, 0.0094)
     assert told.what.endswith(
         "answers in 0.5 ms (median; 0.4 to 0.6 ms) after its request was handed over "

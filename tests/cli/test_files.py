@@ -32,7 +32,7 @@ from multidrop.polling.batch import Batch
 from multidrop.recording import RecordingError, open_recording
 
 
-def test_a_file_that_does_not_fit_on_the_disk_is_removed(tmp_path: Path) -> None:
+def test_an_incomplete_file_is_removed_if_the_disk_is_full(tmp_path: Path) -> None:
     page = tmp_path / "report.html"
     with full_at(100), pytest.raises(OSError, match=f"^{page}: cannot be written: File too large"):
         write_new(page, "x" * 101)
@@ -58,7 +58,9 @@ class PollerOf:
         pass
 
 
-def test_a_full_disk_error_states_the_readable_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_error_states_the_number_of_readable_rows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The second batch does not fit on the disk. The third would fit, but must not follow missing rows."""
     monkeypatch.setattr(PollerOf, "batches", (counting(20), counting(2000), counting(5)))
     monkeypatch.setattr(polling, "Poller", PollerOf)
@@ -90,7 +92,7 @@ def fill(pipe: int) -> None:
     os.set_blocking(pipe, True)
 
 
-def test_every_log_line_lost_because_of_a_slow_reader_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_log_lines_lost_by_a_slow_reader_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(log_thread, "MOST_WAITING", 3)
     unread, log = os.pipe()
     with os.fdopen(unread) as reader, os.fdopen(log, "w") as stream:
@@ -107,7 +109,7 @@ def test_every_log_line_lost_because_of_a_slow_reader_is_counted(monkeypatch: py
     assert told == ["first", lost, "line 0", "line 1", "line 2"]
 
 
-def test_a_closed_log_has_written_all_its_lines() -> None:
+def test_closing_a_log_writes_all_pending_lines() -> None:
     unread, log = os.pipe()
     with os.fdopen(log, "w") as stream:
         handler = LogThread(stream, FORMAT)
@@ -124,7 +126,7 @@ def test_a_closed_log_has_written_all_its_lines() -> None:
         assert not handler._thread.is_alive()
 
 
-def test_a_fleets_gateway_never_waits_for_its_log(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_fleet_gateway_never_waits_for_log_output(monkeypatch: pytest.MonkeyPatch) -> None:
     async def work(*_: object) -> int:
         logging.getLogger("multidrop.fleet").warning("a stop of pump-1")
         return 7

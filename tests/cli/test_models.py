@@ -68,7 +68,7 @@ def test_a_class_is_loaded_from_a_file_beside_the_plant_file(fan: Path) -> None:
     assert model(7).name == "fan@7"
 
 
-def test_a_model_file_is_loaded_once_so_its_drives_share_a_class(fan: Path) -> None:
+def test_two_paths_of_one_model_file_load_the_same_class(fan: Path) -> None:
     assert find_model("fan.py:Fan", fan.parent) is find_model(f"{fan}:Fan")
 
 
@@ -82,7 +82,7 @@ def test_a_class_missing_in_a_model_file_is_reported(fan: Path) -> None:
         assert refused(f"fan.py:{name}", here) == expected
 
 
-def test_a_model_file_that_is_a_link_to_another_type_is_reported(tmp_path: Path) -> None:
+def test_a_model_file_linked_to_a_txt_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "fan.txt").write_text(FAN)
     (tmp_path / "fan.py").symlink_to("fan.txt")
     assert (
@@ -104,14 +104,16 @@ def test_a_model_file_that_is_a_link_to_another_type_is_reported(tmp_path: Path)
         ),
     ],
 )
-def test_a_model_file_error_is_one_sentence_with_the_line(tmp_path: Path, source: str, ending: str) -> None:
+def test_a_model_file_error_is_one_sentence_with_the_line_number(
+    tmp_path: Path, source: str, ending: str
+) -> None:
     (tmp_path / "broken.py").write_text(source)
     sentence = refused("broken.py:Fan", tmp_path)
     assert sentence.startswith(str(tmp_path / "broken.py"))
     assert sentence.endswith(ending)
 
 
-def test_a_model_file_that_failed_is_read_again(tmp_path: Path) -> None:
+def test_a_model_file_is_loaded_again_after_an_error(tmp_path: Path) -> None:
     path = tmp_path / "later.py"
     path.write_text("1 / 0\n")
     assert "ZeroDivisionError" in refused("later.py:Fan", tmp_path)
@@ -152,7 +154,7 @@ def test_a_model_file_imports_only_modules_in_its_own_directory(tmp_path: Path) 
     assert {name for name in {*sys.modules} - names if not name.startswith("multidrop")} == set()
 
 
-def test_a_module_beside_a_model_file_is_run_once(tmp_path: Path) -> None:
+def test_a_module_shared_by_two_model_files_is_run_once(tmp_path: Path) -> None:
     directory = with_scales(tmp_path / "plant", 0.1)
     (directory / "other.py").write_text(USES_SCALES)
     families = [find_model(f"{name}.py:Fan", directory) for name in ("fan", "other")]
@@ -336,7 +338,7 @@ def test_the_models_command_prints_every_register_of_a_family_as_json(run: Run) 
         ),
     ],
 )
-def test_the_models_command_prints_settings_and_limits_of_values(
+def test_the_models_command_prints_line_settings_and_value_limits(
     run: Run, name: str, facts: list[str]
 ) -> None:
     """Settings and limits are printed in the words of the manual (ERMAN, section 3; YD1000, 4.3 and 6.1)."""
@@ -346,7 +348,7 @@ def test_the_models_command_prints_settings_and_limits_of_values(
     assert "3.5 characters" not in shown or name in ("erman-er-g-220", "invt-che", "delixi-modbus")
 
 
-def test_the_models_command_prints_the_limits_of_values_as_json(run: Run) -> None:
+def test_the_models_command_prints_value_limits_as_json(run: Run) -> None:
     _, out, _ = run("models", "yd1000", "--json")
     sheet = json.loads(out)
     by_name = {register["name"]: register for register in sheet["registers"]}

@@ -134,7 +134,7 @@ def test_a_frequency_of_0_is_not_shown_as_stopped(tmp_path: Path) -> None:
     assert live.drives[0].state == "turns"
 
 
-def test_a_register_of_flags_in_which_no_bit_is_set_names_no_state(tmp_path: Path) -> None:
+def test_a_status_register_without_set_bits_names_no_state(tmp_path: Path) -> None:
     path = tmp_path / "hall.toml"
     path.write_text(
         '[[line]]\nname = "hall-1"\nport = "/dev/nowhere"\n'
@@ -203,7 +203,7 @@ def test_an_old_value_is_marked_if_other_values_are_new(watched: LivePlant) -> N
     assert shown[1].split()[1:8] == ["running", "?42.50", "Hz", "2.5", "A", "1.5", "s"]
 
 
-def test_a_slowly_polled_value_is_current_for_three_periods(tmp_path: Path) -> None:
+def test_a_slowly_polled_value_is_marked_old_after_three_periods(tmp_path: Path) -> None:
     path = tmp_path / "hall.toml"
     a_plant(tmp_path, 1)
     path.write_text(path.read_text().replace("address = 1\n", 'address = 1\nevery = "1 min"\n'))
@@ -242,7 +242,7 @@ def test_unpolled_registers_are_read_in_at_most_5_percent_of_the_time(tmp_path: 
 @pytest.mark.long
 @table("size", [(60, 12), (80, 24), (200, 50), (500, 100)])
 @table("drives", [1, 31, 247])
-def test_the_pictures_of_the_monitor_fit_every_terminal_size(
+def test_the_monitor_screen_fits_every_terminal_size(
     tmp_path: Path, size: tuple[int, int], drives: int
 ) -> None:
     live = LivePlant(a_plant(tmp_path, min(drives, 247)))
@@ -294,7 +294,7 @@ def test_a_wide_overview_shows_long_names_in_full(tmp_path: Path) -> None:
     assert texts(overview(live, Position(), (200, 50), after(0), BLOCKS))[3].split()[0] == f">{name}"
 
 
-def test_the_overview_shows_the_last_trigger_if_it_has_room(watched: LivePlant) -> None:
+def test_the_overview_shows_the_last_trigger_if_the_screen_has_room(watched: LivePlant) -> None:
     curves = [f"a.{name}  __##  0 to 4 A" for name in "iuft"] + ["       ^ from -1 s to 2 s"]
     at = Position(trigger=curves)
     for height, shown in ((13, curves), (12, [])):
@@ -441,7 +441,7 @@ def test_the_monitor_sends_a_stop_even_if_no_thread_can_be_started(
     assert not monitor._is_stopping
 
 
-def test_the_monitor_without_threads_sends_all_stops_before_it_waits_for_one(screened: Screened) -> None:
+def test_the_monitor_sends_all_stops_before_waiting_if_no_thread_starts(screened: Screened) -> None:
     monitor, poller = screened
     asked: list[tuple[str, float | None]] = []
 
@@ -497,7 +497,7 @@ def test_the_monitor_counts_stopped_drives_and_lines(screened: Screened) -> None
     assert messages == ["1 of 2 drives stopped, on 1 of 2 lines so far", "2 of 4 drives stopped"]
 
 
-def test_hidden_failures_of_stops_are_shown_once_visible_ones_are_acknowledged(watched: LivePlant) -> None:
+def test_acknowledging_failed_stops_reveals_further_failed_stops(watched: LivePlant) -> None:
     at = Position(failures=[f"drive-{number}: no reply" for number in range(31)])
     shown: list[str] = []
     for more in (24, 17, 10, 3, 0):
@@ -539,7 +539,7 @@ def test_a_failed_stop_is_not_shown_as_repeated(screened: Screened, monkeypatch:
     assert monitor._at.message == "stopping drive-1 failed"
 
 
-def test_the_monitor_ends_only_after_a_running_stop(
+def test_the_monitor_quits_only_after_a_running_stop_ends(
     screened: Screened, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monitor = screened.monitor
@@ -563,7 +563,7 @@ def test_the_monitor_ends_only_after_a_running_stop(
 @pytest.mark.parametrize(
     "keys", ["joksy", "\u043e\u0442\u043b\u044b\u043d", "\u043e\u0442\u043b\u0456\u043d"]
 )
-def test_the_keys_are_the_same_in_cyrillic_layouts(screened: Screened, keys: str) -> None:
+def test_the_monitor_keys_work_in_a_cyrillic_keyboard_layout(screened: Screened, keys: str) -> None:
     screened.press(keys)  # down (j), a key without a function (o), up (k), stop (s), yes (y)
     assert screened.poller.asked == ["drive-1 control STOP"]
 
@@ -589,7 +589,7 @@ def test_page_keys_scroll_a_drives_page_or_choose_a_drive(screened: Screened) ->
     assert monitor._at.chosen == 1
 
 
-def test_no_key_can_do_more_than_stop_motors(screened: Screened) -> None:
+def test_monitor_keys_can_only_stop_motors(screened: Screened) -> None:
     for key in [*string.printable, *KEYS.values()]:
         for answer in "yY\r ":
             screened.press([key, answer])
@@ -623,7 +623,7 @@ def test_the_monitor_restores_its_terminal(plant: Path) -> None:
 
 
 @pytest.mark.long
-def test_each_picture_of_the_monitor_is_drawn_over_the_last(plant: Path) -> None:
+def test_the_monitor_redraws_its_screen_without_scrolling(plant: Path) -> None:
     """If a picture scrolled the screen, the terminal would show parts of two pictures."""
     with on_terminal("monitor", plant) as terminal:
         await_both(terminal)
@@ -659,7 +659,7 @@ def test_the_page_of_a_drive_shows_why_an_unpolled_value_is_missing(plant: Path)
 
 
 @pytest.mark.long
-def test_the_monitor_records_what_it_shows(plant: Path, tmp_path: Path) -> None:
+def test_the_monitor_records_the_displayed_values(plant: Path, tmp_path: Path) -> None:
     out = tmp_path / "seen.arrows"
     with on_terminal("monitor", plant, "--out", out) as terminal:
         await_both(terminal)
@@ -695,7 +695,7 @@ def test_the_monitor_creates_no_recording_if_no_port_opens(tmp_path: Path) -> No
 
 
 @pytest.mark.long
-def test_the_monitor_is_complete_without_colours_and_utf_8(plant: Path) -> None:
+def test_the_monitor_works_without_colours_or_utf_8(plant: Path) -> None:
     environment = {"NO_COLOR": "1", "PYTHONIOENCODING": "ascii"}
     with on_terminal("monitor", plant, size=(200, 50), **environment) as terminal:
         terminal.wait_for(">pump-1")
@@ -706,7 +706,7 @@ def test_the_monitor_is_complete_without_colours_and_utf_8(plant: Path) -> None:
 
 
 @pytest.mark.long
-def test_the_monitor_scrolls_on_a_dumb_terminal(plant: Path) -> None:
+def test_the_monitor_uses_no_escape_codes_on_a_dumb_terminal(plant: Path) -> None:
     with on_terminal("monitor", plant, TERM="dumb") as terminal:
         terminal.wait_for(">pump-1")
         terminal.wait_for("q quit")

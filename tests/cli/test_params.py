@@ -60,7 +60,7 @@ def test_saved_parameters_can_be_applied_again(run: Run, drive: tuple[object, ..
     assert "has these parameters already" in run("params", "apply", "pump.toml", *drive, "--yes")[1]
 
 
-def test_the_apply_action_writes_only_after_confirmation(
+def test_params_apply_writes_only_after_confirmation(
     run: Run, drive: tuple[object, ...], sim: MotorDrive
 ) -> None:
     run("params", "save", *drive, "pump.toml")
@@ -92,7 +92,9 @@ def test_a_refused_write_is_reported_with_the_option_that_permits_it(
 
 
 @pytest.mark.slow
-def test_commissioning_needs_a_terminal(run: Run, drive: tuple[object, ...], sim: MotorDrive) -> None:
+def test_params_apply_with_commissioning_needs_a_terminal(
+    run: Run, drive: tuple[object, ...], sim: MotorDrive
+) -> None:
     run("params", "save", *drive, "pump.toml")
     sim["acceleration_time"] = 25.0
     words = ("params", "apply", "pump.toml", *drive, "--yes", "--commissioning", "--audit", "audit.jsonl")
@@ -111,7 +113,7 @@ def test_commissioning_needs_a_terminal(run: Run, drive: tuple[object, ...], sim
     assert json.loads(Path("audit.jsonl").read_text())["commissioning"] is True
 
 
-def test_the_apply_action_never_writes_to_running_motors(
+def test_params_apply_never_writes_while_the_motor_runs(
     run: Run, drive: tuple[object, ...], sim: MotorDrive
 ) -> None:
     run("params", "save", *drive, "pump.toml")
@@ -222,7 +224,7 @@ def test_a_test_run_with_too_short_steps_is_refused_before_a_port_opens(run: Run
     assert "it would fit with" in errors
 
 
-def test_contradicting_options_of_run_are_refused(run: Run, tmp_path: Path) -> None:
+def test_contradictory_options_of_the_run_command_are_refused(run: Run, tmp_path: Path) -> None:
     path = write_test(tmp_path)
     assert run("run", path, "--speed", 3)[::2] == (
         2,

@@ -359,7 +359,7 @@ def test_the_schema_accepts_the_valid_family_files() -> None:
     assert [text for text in valid if not accepts("family", text)] == []
 
 
-def test_the_loader_refuses_the_family_files_that_break_one_rule() -> None:
+def test_the_family_loader_refuses_every_broken_family_file() -> None:
     assert [text for text in bad_families() if not mistakes("family", text)] == []
 
 
@@ -367,7 +367,7 @@ def test_the_schema_refuses_the_invalid_family_files() -> None:
     check_refusals("family", invalid_families())
 
 
-def test_the_schema_refuses_two_names_with_one_number() -> None:
+def test_the_schema_refuses_two_value_names_for_one_number() -> None:
     def register(names: str) -> str:
         return f"{FAMILIES.HEAD}[reading]\na = {{ at = 1, {names} }}\n"
 
@@ -406,7 +406,7 @@ def test_the_schema_refuses_two_names_with_one_number() -> None:
         ("[[identify]]\nregister = 'device'\nis = [1]\n[[identify]]\nregister = 'dveice'\nis = [1]", False),
     ],
 )
-def test_the_schema_refuses_many_misspelt_names_of_registers(referring: str, is_accepted: bool) -> None:
+def test_the_schema_detects_most_misspelt_register_names(referring: str, is_accepted: bool) -> None:
     names = "[reading]\ndevice = { at = 1 }\nlowest = { at = 2 }\npower_of_ten = { at = 3 }\n"
     option = '[option]\nhighest = { span = [0, 50], meaning = "m" }\n'
     text = f"{FAMILIES.HEAD}{option}{names}{referring.removeprefix(FIRST_SECTION)}\n"
@@ -448,7 +448,7 @@ def test_a_schema_for_given_csv_files_refuses_other_csv_files(tmp_path: Path) ->
         ('value = "integral(output_power)"\nunit = "kW*h"', True),
     ],
 )
-def test_the_schema_checks_registers_and_integrals_of_channels(channel: str, is_accepted: bool) -> None:
+def test_the_schema_checks_most_formulas_of_computed_channels(channel: str, is_accepted: bool) -> None:
     first = '[[line.drive.channel]]\nname = "energy"\nvalue = "integral(output_power)"\nunit = "kWh"\n'
     assert first in PLANTS.FILE
     text = PLANTS.FILE.replace(first, f'[[line.drive.channel]]\nname = "energy"\n{channel}\n')

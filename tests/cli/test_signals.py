@@ -59,7 +59,7 @@ def test_a_closed_terminal_interrupts_a_command_once(hangup_is_deadly: None) -> 
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_while_the_event_loop_is_made_leaves_no_traceback(
+def test_a_signal_during_the_creation_of_the_event_loop_prints_no_traceback(
     number: signal.Signals, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Python would print a traceback for an incomplete loop, and a warning for work that never ran."""
@@ -89,7 +89,7 @@ def test_sighup_is_ignored_under_nohup() -> None:
         signal.signal(signal.SIGHUP, before)
 
 
-def test_a_service_is_ended_only_once_when_its_terminal_is_closed(hangup_is_deadly: None) -> None:
+def test_a_closed_terminal_ends_a_service_only_once(hangup_is_deadly: None) -> None:
     ends: list[int] = []
 
     async def service() -> None:
@@ -151,7 +151,7 @@ def test_the_simulate_command_removes_its_links_when_its_terminal_is_closed(tmp_
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_the_demo_of_serve_ends_when_its_terminal_is_closed() -> None:
+def test_serve_demo_ends_when_its_terminal_is_closed() -> None:
     """SIGHUP makes `serve` reload its plant file, but the demo has none."""
     require_module("uvicorn")
     with closing_terminal("serve", "--demo", "--no-browser") as terminal:
@@ -180,7 +180,7 @@ def test_a_gateway_ends_when_its_terminal_is_closed(tmp_path: Path) -> None:
     [(signal.SIG_DFL, os.getpgrp(), 1), (signal.SIG_DFL, 1, 2), (signal.SIG_IGN, os.getpgrp(), 2)],
     ids=["before a terminal", "in the background", "by nohup"],
 )
-def test_a_closed_terminal_ends_its_foreground_command(
+def test_sighup_of_a_closed_terminal_ends_only_a_foreground_command(
     monkeypatch: pytest.MonkeyPatch, before: signal.Handlers, group: int, reloads: int
 ) -> None:
     came: list[str] = []
@@ -232,7 +232,9 @@ except:
 """
 
 
-def test_ctrl_c_ends_a_conversion(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ctrl_c_during_a_conversion_leaves_no_output_file(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "asammdf.py").write_text(CARELESS)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setitem(sys.modules, "asammdf", None)
@@ -257,7 +259,7 @@ def test_ctrl_c_during_the_first_imports_prints_one_sentence() -> None:
 
 
 @pytest.mark.parametrize("run", [interrupted_class, interrupted_parser])
-def test_an_interruption_wrapped_in_another_exception_prints_one_sentence(
+def test_a_keyboard_interrupt_wrapped_in_an_exception_prints_one_sentence(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], run: Callable[[list[str]], int]
 ) -> None:
     monkeypatch.setattr(cli, "_run_interruptible", run)

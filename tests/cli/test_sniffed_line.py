@@ -116,7 +116,7 @@ def told_as_said(told: dict[str, Any]) -> Said:
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_every_exchange_of_a_mixed_line_is_sniffed() -> None:
+def test_every_exchange_on_a_line_with_mixed_framings_is_sniffed() -> None:
     said, told = mastered()
     assert [told_as_said(record) for record in told[:-1]] == said
     assert told[-1]["summary"] == {

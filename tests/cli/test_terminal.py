@@ -44,14 +44,14 @@ from multidrop.recording import open_writer
 from multidrop.recording.rows import from_rows
 
 
-def test_a_growing_history_keeps_its_points_in_the_same_sparkline_columns() -> None:
+def test_sparkline_points_keep_their_columns_as_the_history_grows() -> None:
     assert sparkline([0, 7, 0, 7, 7, 7, None, None, 0, 0], 5) == "▅▅█ ▁"
     steps = [0.0] * 60 + [7.0] * 60 + [0.0] * 120
     pictures = [sparkline(steps[at : at + 120], 30, points=120 + at) for at in range(100)]
     assert {picture.strip("▁") for picture in pictures[:60]} == {"█" * 15}
 
 
-def test_replaced_characters_keep_the_text_in_its_columns() -> None:
+def test_unencodable_characters_are_replaced_by_text_of_equal_width() -> None:
     text = "Июль 主 26 °C"
     for encoding, shown in (("ascii", "???? ?? 26 ?C"), ("utf-8", text)):
         with TextIOWrapper(BytesIO(), encoding) as terminal:
@@ -59,7 +59,8 @@ def test_replaced_characters_keep_the_text_in_its_columns() -> None:
         assert columns_of(shown) == columns_of(text)
 
 
-def test_each_picture_replaces_the_last_and_is_removed_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_screen_is_drawn_in_the_alternate_terminal_buffer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the end, the terminal shows its former contents again."""
     monkeypatch.setenv("COLUMNS", "6")
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.delenv("NO_COLOR", raising=False)
@@ -83,7 +84,7 @@ def test_each_picture_replaces_the_last_and_is_removed_at_the_end(monkeypatch: p
         (b"\x1bOSy\x1b[1;2S\x1b[[As\x1b[a\x1bOq", [UNKNOWN, "y", UNKNOWN, UNKNOWN, "s", UNKNOWN, UNKNOWN]),
     ],
 )
-def test_the_keys_whose_bytes_arrive_together_are_separated(pressed: bytes, told: list[str]) -> None:
+def test_several_keys_in_one_read_are_separated(pressed: bytes, told: list[str]) -> None:
     found = []
     while pressed:
         key, pressed = next_key(pressed)
@@ -100,7 +101,7 @@ def test_the_keys_whose_bytes_arrive_together_are_separated(pressed: bytes, told
         ([b"\x1b", b""], ["escape"]),
     ],
 )
-def test_a_key_whose_bytes_arrive_separately_is_one_key(
+def test_a_key_split_into_several_reads_is_one_key(
     monkeypatch: pytest.MonkeyPatch, pieces: list[bytes], pressed: list[str]
 ) -> None:
     """A network may split a key's bytes: those of F4 end in S, which must not stop all drives."""
@@ -120,7 +121,7 @@ def test_a_key_whose_bytes_arrive_separately_is_one_key(
     os.close(terminal)
 
 
-def test_a_closed_terminal_is_not_read_in_a_loop(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_waiting_for_a_key_raises_oserror_if_the_terminal_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reads of a closed terminal return immediately, empty or with an error. There may be no signal."""
     fd, slave = os.openpty()
     with open(slave) as stdin:  # noqa: PTH123 (it is no path)
@@ -184,7 +185,7 @@ def test_key_m_adds_a_comment_and_key_t_adds_a_trigger(plant: Path, tmp_path: Pa
     assert events == [("comment", "key k, \u044f"), ("trigger", "key t")]
 
 
-def test_key_m_without_a_recording_says_that_the_comment_would_be_lost() -> None:
+def test_key_m_explains_that_comments_need_a_recording() -> None:
     poller, table = SimpleNamespace(mark=pytest.fail), SimpleNamespace(note="")
     keys = Keys(cast(Any, poller), cast(Any, table), lambda seconds: "", has_trigger=False, is_recorded=False)
     assert table.note == "Ctrl-C: end"
@@ -204,7 +205,9 @@ def test_the_terminal_shows_the_signal_around_the_last_trigger(plant: Path, tmp_
         terminal.wait_for("1 trigger recorded")
 
 
-def test_the_picture_of_a_trigger_shows_its_moment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_picture_of_a_trigger_marks_the_trigger_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     about = {"condition": "a.i > 3", "time_ns": 2 * 10**9, "pre_s": 1.0, "post_s": 3.0}
     registers = {"i": {"unit": "A"}, "u": {"unit": "V"}}
     rows = [Row(at * 10**8, at, 0, "a", name, float(at == 25), "ok") for at in range(10, 40) for name in "iu"]
@@ -262,7 +265,7 @@ def drawings(tmp_path: Path, encoding: str, size: list[int], *widths: int) -> li
     return found
 
 
-def test_a_line_cut_to_the_terminals_width_ends_with_a_mark(tmp_path: Path, size: list[int]) -> None:
+def test_a_line_wider_than_the_terminal_ends_with_a_tilde(tmp_path: Path, size: list[int]) -> None:
     whole, narrow = drawings(tmp_path, "utf-8", size, 80, 40)
     head = "DRIVE   SAMPLES  MISSES  NEWEST VALUES\n"
     assert whole == f"{head}{WIDE_NAME}        1       0  output_frequency 42.50 Hz\n"
@@ -275,9 +278,10 @@ def test_a_wrapped_table_is_redrawn_after_the_terminal_narrowed(tmp_path: Path, 
     assert again == ["\x1b[2F\x1b[J", "\x1b[3F\x1b[J"]
 
 
-def test_the_live_table_stays_below_warnings_and_counts_only_registers(
+def test_the_live_table_is_redrawn_below_a_warning(
     tmp_path: Path, size: list[int], capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """The table does not count the values of computed channels."""
     path = tmp_path / "plant.toml"
     drive = DRIVE.format("pump")
     channel = '[[line.drive.channel]]\nname = "hertz"\nvalue = "output_frequency"\nunit = "Hz"\n'

@@ -51,7 +51,9 @@ def test_printable_text_stays_unchanged() -> None:
 
 
 @pytest.mark.parametrize("form", ["text", "json"])
-def test_a_gateways_log_escapes_the_names_of_callers(capfd: pytest.CaptureFixture[str], form: str) -> None:
+def test_the_gateway_log_escapes_control_characters_in_names(
+    capfd: pytest.CaptureFixture[str], form: str
+) -> None:
     """A caller's address may come from a proxy, and a drive's name may come from an MQTT topic."""
     with logging_to_stderr(form, {"multidrop": logging.INFO}):
         logging.getLogger("multidrop.gateway").warning("stop of %s, asked for by %s", TRAP, "anna")
@@ -83,7 +85,7 @@ def test_a_url_is_printed_without_user_and_password() -> None:
         (["read", "{}", "invt-che", "1", "status"], {}),
     ],
 )
-def test_the_messages_of_commands_contain_no_password_of_a_url(
+def test_command_messages_contain_no_url_password(
     words: list[str],
     variables: dict[str, str],
     tmp_path: Path,
@@ -103,7 +105,7 @@ def test_the_messages_of_commands_contain_no_password_of_a_url(
     assert "R:ET" not in said
 
 
-def test_a_plant_files_mistakes_are_reported_without_a_urls_password(tmp_path: Path) -> None:
+def test_plant_file_errors_contain_no_url_password(tmp_path: Path) -> None:
     (tmp_path / "p.toml").write_text(
         '[[line]]\nname = "L"\nport = "/dev/a"\n'
         '[[line.drive]]\nname = "D"\nmodel = "invt-che"\naddress = 1\n'
@@ -122,9 +124,7 @@ def test_a_plant_files_mistakes_are_reported_without_a_urls_password(tmp_path: P
 
 
 @pytest.mark.parametrize("form", ["text", "json"])
-def test_the_log_of_a_gateway_contains_no_password_of_a_url(
-    capfd: pytest.CaptureFixture[str], form: str
-) -> None:
+def test_the_gateway_log_contains_no_url_password(capfd: pytest.CaptureFixture[str], form: str) -> None:
     with logging_to_stderr(form, {"multidrop": logging.INFO}):
         failure = OSError(f"nats://bob:{SECRET}@host is lost")
         logging.getLogger("multidrop.gateway").error("at %s", f"nats://{SECRET}@host", exc_info=failure)
@@ -134,7 +134,7 @@ def test_the_log_of_a_gateway_contains_no_password_of_a_url(
 
 
 @table("trap", TRAPS)
-def test_a_name_or_port_that_cannot_be_printed_is_refused(tmp_path: Path, trap: str) -> None:
+def test_unprintable_names_and_ports_are_refused(tmp_path: Path, trap: str) -> None:
     text = "".join(f"\\u{ord(character):04x}" for character in trap)
     path = tmp_path / "plant.toml"
     path.write_text(
@@ -270,7 +270,7 @@ def test_every_command_prints_through_the_escaping_function() -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("command", usually("poll", "plan"))
-def test_a_users_model_file_that_is_run_is_reported_once(tmp_path: Path, command: str) -> None:
+def test_running_a_users_model_file_is_reported_once(tmp_path: Path, command: str) -> None:
     """The command runs in a new process, because each process reports this only once."""
     (tmp_path / "fan.py").write_text(
         "from pathlib import Path\nfrom multidrop import Drive, reading\n"
@@ -305,7 +305,7 @@ address = 1
 
 
 @pytest.mark.parametrize("words", [["plan"], ["plan", "--json"]])
-def test_a_letter_that_the_encoding_lacks_is_printed_as_an_escape(
+def test_an_unencodable_letter_is_printed_as_an_escape(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str]
 ) -> None:
     plant, out = tmp_path / "plant.toml", BytesIO()
@@ -325,7 +325,7 @@ ODD = ["1_0", "\uff11\uff12", "\u0663", "\u0967\u0968", "\U0001d7cf", "\u00bd", 
 
 
 @table("text", [*ODD, "", "-", "0x10", "0b1", "1 2", "1,5"])
-def test_a_text_without_plain_decimal_digits_is_not_parsed_as_a_number(text: str) -> None:
+def test_text_other_than_plain_decimal_digits_is_not_parsed_as_a_number(text: str) -> None:
     for parse in (plain_number, plain_whole):
         with pytest.raises(ValueError, match="in decimal digits"):
             parse(text)
@@ -376,6 +376,8 @@ def test_digits_other_than_ascii_are_refused_in_requests_and_files(text: str) ->
         ["doctor", "/dev/none", "--address", "{}"],
     ],
 )
-def test_only_ascii_digits_are_valid(words: list[str], text: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_arguments_accept_only_ascii_digits(
+    words: list[str], text: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main([word.format(text) for word in words]) == 2
     assert "no such" not in capsys.readouterr().err.lower()  # neither a port nor a file was opened

@@ -391,7 +391,7 @@ def test_the_index_and_api_pages_are_plain_markdown(page: str) -> None:
     assert re.findall(r"^```\{.*|^: .*|^:::.*", text, re.MULTILINE) == []
 
 
-def test_every_page_is_in_the_contents() -> None:
+def test_every_page_is_in_the_table_of_contents() -> None:
     text = (DOCS / "index.md").read_text("utf-8")
     linked = set(re.findall(r"\(([\w/-]+\.md)\)", text))
     # these pages are parts of other pages
@@ -522,9 +522,7 @@ def revision(text: str) -> str:
 
 
 @of_each_page
-def test_a_translation_has_the_headings_list_items_and_code_blocks_of_its_page(
-    language: str, page: str
-) -> None:
+def test_each_translation_has_the_structure_of_the_english_page(language: str, page: str) -> None:
     assert PARTS.findall(translation(language, page)) == PARTS.findall(ENGLISH[page])
 
 
@@ -537,7 +535,7 @@ def test_each_translated_section_has_the_names_and_figures_of_the_english_one(
 
 
 @of_each_page
-def test_a_translation_names_the_present_revision_of_its_page(language: str, page: str) -> None:
+def test_each_translation_names_the_current_revision_of_the_english_page(language: str, page: str) -> None:
     assert f"<!-- translates revision {revision(ENGLISH[page])} -->" in translation(language, page)
 
 

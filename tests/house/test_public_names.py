@@ -32,7 +32,7 @@ def run(*words: str) -> str:
     return subprocess.run([sys.executable, *words], capture_output=True, text=True, check=True).stdout
 
 
-def test_a_public_name_is_the_object_of_its_module() -> None:
+def test_each_public_name_refers_to_the_object_in_its_module() -> None:
     for name in NAMES:
         home = import_module(multidrop._HOMES[name])
         assert getattr(multidrop, name) is getattr(home, name)
@@ -66,7 +66,7 @@ def test_the_package_runs_as_a_module() -> None:
     assert "usage: multidrop" in run("-m", "multidrop", "--help")
 
 
-def test_a_family_is_declared_with_public_names() -> None:
+def test_public_names_suffice_to_declare_a_family() -> None:
     """Declare a user's own family with public names only."""
 
     class Own(multidrop.Drive):
@@ -110,7 +110,7 @@ def test_dir_of_the_package_lists_only_its_few_public_names() -> None:
     assert dir(multidrop) == sorted(multidrop.__all__)
 
 
-def test_the_help_of_a_verb_has_its_signature() -> None:
+def test_the_help_of_a_drive_method_shows_the_signature() -> None:
     shown = render_doc(multidrop.YD1000.start, renderer=plaintext)
     assert "start(self, direction: " in shown
     assert str(signature(Toy(1).stop)) == "()"
@@ -315,7 +315,7 @@ print(len(names), *failed, sep="\\n")
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_every_module_can_be_imported_without_posix() -> None:
+def test_every_module_can_be_imported_without_posix_modules() -> None:
     require_module("matplotlib")
     ran = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=False)
     assert ran.returncode == 0, ran.stderr

@@ -129,7 +129,7 @@ def test_the_logger_example_records_to_parquet(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_test_bench_example_measures_and_records_each_step(tmp_path: Path) -> None:
+def test_the_test_bench_example_measures_and_records_each_step(tmp_path: Path) -> None:
     lines = run(tmp_path, "test_bench.py", "0.5").splitlines()
     assert [line.partition(":")[0] for line in lines] == ["10.0 Hz", "20.0 Hz", "30.0 Hz"]
     assert {row.drive for batch in open_recording(tmp_path / "bench.arrows") for row in batch} == {"fan"}

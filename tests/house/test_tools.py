@@ -254,14 +254,14 @@ SLEEPS = [sys.executable, "-c", "import time; time.sleep(3600)"]
 
 
 @pytest.mark.long
-def test_a_with_block_that_fails_kills_its_process() -> None:
+def test_a_process_is_killed_if_its_with_block_fails() -> None:
     with pytest.raises(ZeroDivisionError), BoundProcess(SLEEPS) as process:
         raise ZeroDivisionError
     assert process.returncode
 
 
 @pytest.mark.long
-def test_no_test_starts_a_process_that_may_outlive_it() -> None:
+def test_no_test_starts_a_process_with_bare_popen() -> None:
     unbound = "with subprocess." + "Popen("
     assert [str(path) for path in TESTS.rglob("*.py") if unbound in path.read_text("utf-8")] == []
 
@@ -287,7 +287,9 @@ def test_every_failing_row_of_a_test_table_is_reported() -> None:
     assert notes(caught) == [["in the row (1,)"], ["in the row (3,)"]]
 
 
-def test_a_table_row_fails_if_skipped_or_if_an_expected_error_is_missing() -> None:
+def test_a_skipped_row_of_a_test_table_fails() -> None:
+    """A row also fails if it does not raise the error that the test expects."""
+
     @table(("one", "other"), [(1, 2), (2, 2), (3, 3)], ids=["a", "b", "c"])
     def differ(one: int, other: int) -> None:
         if one == 3:
@@ -334,7 +336,7 @@ def never_named(tree: ast.AST) -> list[str]:
 
 
 @pytest.mark.long
-def test_every_inner_function_is_used() -> None:
+def test_every_inner_function_in_tests_is_used() -> None:
     found = {}
     for path in sorted(TESTS.rglob("*.py")):
         if lost := never_named(ast.parse(path.read_text("utf-8"))):
@@ -342,7 +344,7 @@ def test_every_inner_function_is_used() -> None:
     assert found == {}
 
 
-def test_unused_inner_function_is_detected() -> None:
+def test_an_unused_inner_function_is_detected() -> None:
     told = "def test_it():\n    async def main(): assert False\n"
     assert never_named(ast.parse(told)) == ["main in test_it, line 2"]
     assert never_named(ast.parse(told + "    run(main())\n")) == []

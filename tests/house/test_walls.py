@@ -374,7 +374,7 @@ def test_each_step_of_a_walkthrough_names_existing_code(walk: Path) -> None:
     assert missing(walk) == []
 
 
-def test_a_step_of_a_walkthrough_that_names_missing_code_is_detected(tmp_path: Path) -> None:
+def test_missing_code_in_a_walkthrough_is_detected(tmp_path: Path) -> None:
     walk = tmp_path / "walk.md"
     walk.write_text("`poller.py:Poller.take_off`, `nowhere.c`, `poller.py:Poller`, `csrc/line.c`")
     assert missing(walk) == ["poller.py:Poller.take_off", "nowhere.c:"]

@@ -169,7 +169,7 @@ def test_one_register_is_written_with_the_function_code_of_the_caller() -> None:
 
 
 @needs_package
-def test_a_write_to_a_register_that_returns_to_0_raises_no_error(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_write_raises_no_error_if_the_register_returns_to_0(caplog: pytest.LogCaptureFixture) -> None:
     """If this write raised an error, a caller might write again and so repeat the command."""
 
     async def use(connection: Any, registers: Registers) -> None:

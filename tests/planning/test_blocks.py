@@ -87,7 +87,7 @@ def test_a_write_only_register_in_a_read_plan_is_refused() -> None:
         blocks(Example(1), [Example.run])
 
 
-def test_planned_reads_and_writes_are_requests_of_the_modbus_standard() -> None:
+def test_planned_reads_and_writes_are_standard_modbus_requests() -> None:
     (block,) = blocks(Example(7), [Example.a, Example.b])
     assert block.request == Message(7, 3, 1, 2)
     assert write_request(Example(7), Example.coil, 1) == Message(7, 5, 3, data=b"\xff\x00")
@@ -219,7 +219,7 @@ class Scattered(Drive):
     st.floats(0, 0.2),
     st.floats(0, 1),
 )
-def test_a_read_plan_is_quickest_only_within_its_range_of_response_delays(
+def test_a_read_plan_is_fastest_only_within_its_range_of_response_delays(
     wanted: set[Register[float]], baudrate: int, framing: Framing, delay: float, part: float
 ) -> None:
     drive = Scattered(1, baudrate=baudrate, framing=framing)
@@ -241,7 +241,7 @@ def test_a_read_plan_is_quickest_only_within_its_range_of_response_delays(
             assert excess(outside) > 1e-6
 
 
-def test_a_delay_suits_a_read_plan_if_it_suits_each_polling_rate() -> None:
+def test_the_delay_range_of_a_read_plan_fits_every_polling_rate() -> None:
     drive = Scattered(1, baudrate=9600)
     rates = {0.1: [Scattered.r0, Scattered.r2], None: [Scattered.r3, Scattered.r5]}
     apart = [
@@ -257,9 +257,7 @@ def test_a_delay_suits_a_read_plan_if_it_suits_each_polling_rate() -> None:
 
 @table("framing", list(Framing))
 @table("table", [HOLDING, INPUT, COIL, DISCRETE])
-def test_the_predicted_number_of_characters_equals_that_of_built_frames(
-    framing: Framing, table: Table
-) -> None:
+def test_predicted_frame_lengths_equal_those_of_built_frames(framing: Framing, table: Table) -> None:
     drive = Example(1)
     drive.framing = framing
     for count in range(1, 126):
@@ -361,7 +359,7 @@ def test_the_pause_between_two_drives_is_the_longer_silence_plus_the_switching_t
     assert gap(fast, fast, switching=0.002) == pytest.approx(1.75e-3 + 1 / 38400)
 
 
-def test_a_table_without_a_read_function_cannot_be_read() -> None:
+def test_a_register_table_without_a_read_function_cannot_be_read() -> None:
     table = Table("command word", None, 0x06)
     with pytest.raises(ValueError, match=r"^a command word cannot be read$"):
         read_request(Example(1), table, 0, 1)
@@ -432,7 +430,7 @@ def test_the_requests_for_the_built_in_families_are_unchanged(model: str) -> Non
     assert sorted(found) == REQUESTS[model]
 
 
-def test_fewer_requests_read_a_meter_if_they_may_include_undeclared_addresses() -> None:
+def test_reading_undeclared_addresses_reduces_the_requests_for_a_meter() -> None:
     assert len(ADDRESSES) == 39
     lines = []
     for meter in (Meter, StatedMeter):

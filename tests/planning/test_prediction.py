@@ -146,7 +146,7 @@ def test_registers_without_a_period_use_the_remaining_line_time() -> None:
     assert predict(asked(timed, 0.1)).utilisation == pytest.approx(load)
 
 
-def test_the_predicted_rate_is_at_most_the_rate_that_the_line_allows() -> None:
+def test_the_predicted_rate_never_exceeds_the_capacity_of_the_line() -> None:
     drives = [Simple(address, format="8N1") for address in range(1, 5)]
     found = predict([each for drive in drives for each in asked(drive, 0.05)])
     assert found.utilisation == pytest.approx(8 * (OWN + SILENCE) / 0.05)
@@ -218,7 +218,9 @@ PERIODS = st.sampled_from([None, 0.02, 0.1, 0.5, 2.0])
 @pytest.mark.story
 @settings(max_examples=examples(40), deadline=None)
 @given(st.lists(st.tuples(st.sampled_from(sorted(MODELS)), PERIODS), min_size=1, max_size=8))
-def test_predicted_rates_need_no_more_time_than_the_line_has(wanted: list[tuple[str, float | None]]) -> None:
+def test_the_exchanges_predicted_for_a_second_fit_into_a_second(
+    wanted: list[tuple[str, float | None]],
+) -> None:
     """The exchanges that are predicted for one second fit into one second."""
     exchanges: list[Planned] = []
     for address, (model, every) in enumerate(wanted, 1):
@@ -326,7 +328,7 @@ SENTENCE = (
 )
 
 
-def test_requests_across_gaps_save_a_fifth_of_the_time() -> None:
+def test_reads_across_address_gaps_save_a_fifth_of_the_time() -> None:
     drive = Meter(1, baudrate=9600, format="8N1")
     gain = reading_gain(drive, [(drive.register(name), None) for name in ADDRESSES])
     assert gain is not None
@@ -353,7 +355,7 @@ def test_a_suggestion_for_a_family_file_is_written_in_toml(tmp_path: Path) -> No
     assert gains[1] is None
 
 
-def test_requests_across_gaps_are_not_suggested_if_declared_or_useless() -> None:
+def test_reads_across_address_gaps_are_suggested_only_if_useful() -> None:
     class Compact(Drive):
         a = reading(1)
         b = reading(2)
@@ -376,7 +378,7 @@ def test_suggested_reads_do_not_exceed_the_read_limit_of_the_class() -> None:
     assert [len(gap) for _, gap in gain.gaps] == [1]
 
 
-def test_requests_across_gaps_are_suggested_only_for_a_users_own_class(
+def test_reads_across_address_gaps_are_suggested_only_for_user_classes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     plant = tmp_path / "hall.toml"

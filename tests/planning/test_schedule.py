@@ -59,7 +59,7 @@ def test_periodic_polls_are_due_at_multiples_of_the_period() -> None:
     assert poll.skipped == 0
 
 
-def test_missed_polls_of_a_stall_are_counted_and_skipped() -> None:
+def test_polls_missed_during_a_stall_are_counted_and_skipped() -> None:
     made = schedule(poll := job(period_ms=20))
     assert take(made, 0, 1) == [(poll, 0)]
     assert take(made, 110, 1) == [(poll, 100)]  # the polls due at 20, 40, 60 and 80 ms were missed
@@ -67,7 +67,7 @@ def test_missed_polls_of_a_stall_are_counted_and_skipped() -> None:
     assert take(made, 111, 10) == [(poll, 120)]
 
 
-def test_a_poll_whose_slot_ends_before_the_line_is_free_is_not_queued() -> None:
+def test_a_poll_is_skipped_if_its_period_ends_before_the_line_is_free() -> None:
     """Earlier requests keep the line busy until the poll's period is over."""
     made = schedule(poll := job(period_ms=20))
     assert made.take(0, 110 * MS, 111 * MS, 9) == [(poll, 100 * MS, 100 * MS)]
@@ -120,7 +120,7 @@ def test_a_poll_without_a_period_continues_when_an_overload_starts() -> None:
     assert taken.count(turn) >= 3000 / 10 * TURN_SHARE - 6
 
 
-def test_a_poll_without_a_period_does_not_save_up_unused_time() -> None:
+def test_a_poll_without_a_period_does_not_accumulate_unused_time() -> None:
     made = schedule(job(1, 10, duration_ms=10))
     take(made, 0, 10_000)
     made.add(turn := job(2, duration_ms=10), 10_000 * MS)
@@ -143,7 +143,7 @@ def test_an_urgent_poll_goes_before_polls_with_the_present_line_settings() -> No
     assert one.skipped == 0
 
 
-def test_the_polls_without_a_period_are_sent_one_after_another() -> None:
+def test_polls_without_a_period_are_sent_in_rotation() -> None:
     jobs = [job(drive) for drive in range(5)]
     made = schedule(*jobs)
     assert [each for each, _ in take(made, 0, 35)] == [*jobs, *jobs[:2]]
@@ -171,12 +171,12 @@ def test_a_schedule_returns_at_most_the_given_number_of_requests() -> None:
     assert len(take(made, 0, 1000, most=7)) == 7
 
 
-def test_a_schedule_returns_at_least_one_request_even_if_it_is_long() -> None:
+def test_a_schedule_returns_a_request_longer_than_the_planned_time() -> None:
     made = schedule(long := job(duration_ms=500))
     assert take(made, 0, 1) == [(long, 0)]
 
 
-def test_no_request_is_planned_if_queued_requests_last_until_the_horizon() -> None:
+def test_no_request_is_planned_while_queued_requests_fill_the_planning_horizon() -> None:
     made = schedule(job(1))
     assert made.take(0, 100 * MS, 100 * MS, 9) == []
     assert len(made.take(0, 90 * MS, 100 * MS, 9)) == 2
@@ -194,7 +194,7 @@ def test_the_silence_before_a_request_takes_no_time_on_an_idle_line(
         assert len(made.take(15 * MS, 15 * MS, end_ms * MS + later_ns, 9)) == planned
 
 
-def test_a_silent_drive_is_asked_less_often_each_time_while_others_are_polled() -> None:
+def test_a_silent_drive_is_retried_at_growing_intervals() -> None:
     dead, alive = job(1), job(2)
     made = schedule(dead, alive)
     fail(made, 1, 2, now_ms=0)
@@ -212,7 +212,7 @@ def test_a_silent_drive_is_asked_less_often_each_time_while_others_are_polled() 
     assert LONGEST_PAUSE_NS // MS <= rests[-1] <= LONGEST_PAUSE_NS // MS + 100
 
 
-def test_a_silent_drive_is_asked_again_exactly_when_its_pause_ends() -> None:
+def test_a_silent_drive_is_retried_exactly_when_its_pause_ends() -> None:
     made = schedule(dead := job(1))
     at = 0
     for failures, rest_ms in enumerate([500, 1000, 2000, 2000], 2):
@@ -222,7 +222,7 @@ def test_a_silent_drive_is_asked_again_exactly_when_its_pause_ends() -> None:
         assert [each for each, _, _ in made.take(at, at, at + 1, 9)] == [dead]
 
 
-def test_a_drive_with_long_timeouts_has_only_one_short_pause() -> None:
+def test_only_the_first_pause_of_a_drive_with_long_timeouts_is_short() -> None:
     made = schedule(lossy := job(1))
     for failures, at_ms, rest_ms in ((2, 0, 500), (3, 500, 20_000)):
         made.back_off.observe(1, failures, at_ms * MS, late_until_ns=0, cost_ns=300 * MS)
@@ -284,7 +284,7 @@ def test_a_silent_drive_gets_a_single_request_until_it_answers() -> None:
     assert len({each for each, _ in take(made, 520, 50)}) == 3
 
 
-def test_a_silent_drive_gets_its_shortest_request_whatever_its_rate() -> None:
+def test_a_silent_drive_is_retried_with_its_shortest_request() -> None:
     made = schedule(job(1, 100, 20), short := job(1, 60_000, 7), job(1, None, 9))
     fail(made, 1, 2, now_ms=0)
     take(made, 1, 400)
@@ -371,7 +371,7 @@ def test_the_schedule_reserves_the_whole_timeout_for_a_request_to_a_silent_drive
     assert take(made, 60_000, 300) == [(dead, 0)]
 
 
-def test_a_pause_does_not_end_if_the_same_failures_are_reported_again() -> None:
+def test_repeated_failure_reports_do_not_end_a_drives_pause() -> None:
     made = schedule(poll := job(1), job(2))
     for now in (0, 100):
         fail(made, 1, 2, now_ms=now)
@@ -392,25 +392,25 @@ def test_every_poll_of_a_silent_drive_is_reported_with_its_due_time() -> None:
     assert made.unasked == [(poll, due * MS) for due in (0, 100, 200, 300)]
 
 
-def test_a_poll_without_a_period_is_missed_once_per_pause() -> None:
+def test_a_poll_without_a_period_counts_as_missed_once_per_pause() -> None:
     made = schedule(poll := job(1), job(2))
     fail(made, 1, 2, now_ms=7)
     take(made, 8, 300)
     assert made.unasked == [(poll, 7 * MS)]
 
 
-def test_a_skip_of_all_polls_includes_polls_without_a_period() -> None:
+def test_skipping_all_polls_includes_polls_without_a_period() -> None:
     made = schedule(poll := job(1, period_ms=100), fast := job(2))
     assert made.pass_all(150 * MS) == [(fast, 150 * MS), (poll, 0), (poll, 100 * MS)]
 
 
-def test_a_poll_that_was_due_but_not_sent_is_skipped() -> None:
+def test_skipping_due_polls_returns_every_missed_period() -> None:
     made = schedule(poll := job(1, period_ms=100), job(2))
     take(made, 0, 50)
     assert made.pass_slots(250 * MS) == [(poll, 100 * MS), (poll, 200 * MS)]
 
 
-def test_a_poll_that_is_due_now_is_skipped_too() -> None:
+def test_skipping_due_polls_includes_polls_due_now() -> None:
     made = schedule(one := job(1, 100), two := job(2, 100), begun := job(3, 1000))
     assert [each for each, _ in take(made, 0, 100, most=2)] == [one, two]
     assert made.pass_slots(100 * MS) == [(begun, 0), (one, 100 * MS), (two, 100 * MS)]
@@ -427,7 +427,7 @@ def test_the_order_of_polls_stays_when_one_is_removed() -> None:
     assert made.jobs == [*jobs[1:], other]
 
 
-def test_a_poll_that_is_removed_when_it_is_due_is_not_sent() -> None:
+def test_a_due_poll_is_not_sent_after_its_removal() -> None:
     made = schedule(first := job(1, 1000), second := job(2, 1000))
     assert take(made, 0, 100, most=1) == [(first, 0)]
     made.remove(second)
@@ -462,7 +462,7 @@ def test_a_poll_without_a_period_gets_the_place_of_the_replaced_one() -> None:
     assert [asked for asked, _ in take(made, 100, 15)] == [new, jobs[2], jobs[0]]
 
 
-def test_no_bus_cycle_is_repeated_with_silent_drives_or_periodic_polls() -> None:
+def test_a_schedule_has_no_repeatable_cycle_with_silent_drives_or_periodic_polls() -> None:
     made = schedule(one := job(1), two := job(2))
     assert made.cycle(0) == [one, two]
     fail(made, 1, 0, now_ms=0)
@@ -669,7 +669,7 @@ def test_only_polls_within_the_planning_horizon_are_planned() -> None:
     assert take(made, 0, 100) == [(soon, 10)]
 
 
-def test_the_order_of_polls_continues_after_a_poll_is_removed() -> None:
+def test_polling_continues_with_the_following_poll_if_the_next_one_is_removed() -> None:
     first, second, third = job(1), job(2), job(3)
     made = schedule(first, second, third)
     assert take(made, 0, 1, 1) == [(first, 0)]
@@ -677,7 +677,7 @@ def test_the_order_of_polls_continues_after_a_poll_is_removed() -> None:
     assert [each for each, _ in take(made, 5, 1, 1)] == [third]
 
 
-def test_a_drive_that_was_forgotten_is_polled_like_a_new_drive() -> None:
+def test_a_removed_drive_is_polled_like_a_new_drive_when_added_again() -> None:
     made = schedule(silent := job(1), job(2))
     fail(made, 1, 9, 0)
     made.remove(silent)
@@ -720,7 +720,7 @@ def test_no_poll_of_a_new_drive_is_lost_repeated_or_early() -> None:
     assert (fast.skipped, slow.skipped) == (0, 0)
 
 
-def test_a_new_drive_that_does_not_reply_gets_no_more_requests_for_a_while() -> None:
+def test_a_silent_new_drive_gets_no_further_requests_for_a_while() -> None:
     made = meet(dead := job(1), living := job(2))
     assert [asked for asked, _ in take(made, 0, 100)] == [dead, living]
     answer(made, living, 1)
@@ -735,7 +735,7 @@ def test_a_new_drive_that_does_not_reply_gets_no_more_requests_for_a_while() -> 
     assert set(made.cycle((60 + rest_ms) * MS)) == {dead, living}
 
 
-def test_silent_new_drives_are_retried_immediately_if_this_takes_little_time() -> None:
+def test_silent_new_drives_are_retried_immediately_if_retries_are_quick() -> None:
     """The drives may exist, because their first request or reply may have been lost."""
     lost, living = job(1), job(2)
     for cost_ns, again in {400 * MS: {lost}, 400 * MS + 1: set()}.items():
@@ -752,7 +752,7 @@ def test_silent_new_drives_are_retried_immediately_if_this_takes_little_time() -
         assert lost not in {asked for asked, _ in take(made, 230, 20)}
 
 
-def test_a_reply_of_a_silent_drive_shortens_another_drives_pause() -> None:
+def test_a_recovered_drive_shortens_the_pause_of_another_silent_drive() -> None:
     made = schedule(*(jobs := [job(drive) for drive in range(3)]))
     fail(made, 0, 2, 0, late_until_ms=300)
     fail(made, 1, 2, 100)
@@ -762,7 +762,7 @@ def test_a_reply_of_a_silent_drive_shortens_another_drives_pause() -> None:
     assert {asked for asked, _ in take(made, 300, 50)} == {jobs[0], jobs[2]}
 
 
-def test_a_reply_of_a_silent_drive_shortens_only_one_pause() -> None:
+def test_a_recovered_drive_shortens_only_one_other_pause() -> None:
     made = schedule(*(jobs := [job(drive) for drive in range(4)]))
     for failures, drive in itertools.product((2, 3), (0, 1, 2)):
         made.back_off.observe(drive, failures, 0, late_until_ns=0, cost_ns=300 * MS)
@@ -781,7 +781,7 @@ def plans(made: Schedule[Job]) -> list[list[tuple[Job, int, int | None]]]:
     return [[*made.take(at * MS, at * MS, until * MS, 9)] for at, until in ((0, 12), (12, 60))]
 
 
-def test_requests_that_were_not_sent_are_planned_again_in_order() -> None:
+def test_unsent_requests_are_planned_again_in_the_same_order() -> None:
     made = schedule(job(1, 40), job(2), job(3, 60), job(4))
     before = plans(made)
     assert [len(plan) for plan in before] == [3, 9]

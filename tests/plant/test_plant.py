@@ -171,7 +171,7 @@ address = 3
 """
 
 
-def test_a_line_does_not_shorten_the_silence_that_a_family_needs(load: Load) -> None:
+def test_the_silence_setting_of_a_line_keeps_a_familys_required_silence(load: Load) -> None:
     (line,) = load(SILENT).lines
     assert [polled.drive.needed_silence() for polled in line.drives] == pytest.approx([500e-6, 10e-3, 0])
     assert line.switching == 0
@@ -182,7 +182,7 @@ def test_a_line_does_not_shorten_the_silence_that_a_family_needs(load: Load) -> 
     assert [polled.drive.needed_silence() for polled in line.drives] == pytest.approx([1.75e-3, 10e-3, 0])
 
 
-def test_the_echo_of_a_line_is_detected_unless_the_plant_file_declares_it(load: Load) -> None:
+def test_the_echo_setting_of_a_line_is_automatic_by_default(load: Load) -> None:
     assert load(SILENT).lines[0].echo is Echo.AUTO
     assert load(SILENT.replace('silence = "500 us"', 'echo = "off"')).lines[0].echo is Echo.OFF
 
@@ -193,7 +193,7 @@ def test_the_key_realtime_applies_to_all_lines_of_a_plant_file(load: Load, mista
     assert mistakes("realtime = 1\n" + GOOD) == ["realtime = 1 is not right; write realtime = true"]
 
 
-def test_a_drive_without_poll_polls_all_readings_as_fast_as_possible(load: Load) -> None:
+def test_a_drive_without_a_poll_list_polls_all_readings_continuously(load: Load) -> None:
     (pump,) = load(GOOD).lines[1].drives
     assert [(poll.register.name, poll.every) for poll in pump.polls] == [
         ("output_frequency", None),
@@ -629,7 +629,7 @@ def two_lines(directory: Path) -> Path:
     return path
 
 
-def test_new_ports_change_nothing_else_in_a_plant(tmp_path: Path) -> None:
+def test_replacing_ports_changes_nothing_else_in_a_plant(tmp_path: Path) -> None:
     plant = load_plant(two_lines(tmp_path))
     changed = plant.with_ports({"roof": "ports/roof"})
     assert [line.port for line in changed.lines] == ["/dev/hall", "ports/roof"]
@@ -638,7 +638,7 @@ def test_new_ports_change_nothing_else_in_a_plant(tmp_path: Path) -> None:
     assert plant.with_ports({"roof": "/dev/hall", "hall": "/dev/roof"}).lines[0].port == "/dev/roof"
 
 
-def test_unknown_lines_and_duplicate_new_ports_are_refused(tmp_path: Path) -> None:
+def test_replacing_ports_refuses_unknown_lines_and_duplicate_ports(tmp_path: Path) -> None:
     plant = load_plant(two_lines(tmp_path))
     with pytest.raises(ValueError, match=r"plant\.toml has no line 'rof'; did you mean roof\?"):
         plant.with_ports({"rof": "x"})
@@ -728,7 +728,7 @@ def test_drive_names_similar_to_reserved_ones_are_allowed(name: str) -> None:
     assert check_drive_name(name)
 
 
-def test_no_option_of_a_family_file_has_the_name_of_a_plant_file_key() -> None:
+def test_a_family_option_cannot_have_the_name_of_a_plant_file_key() -> None:
     assert set(DRIVE_KEYS) <= NOT_OPTIONS
 
 

@@ -114,7 +114,7 @@ def mistake(data: str | bytes) -> tuple[int, str]:
         (b"a = 1\nb = '\xe4'", 2, "the file is not text in UTF-8, from byte 11 on (0xE4); save it as UTF-8"),
     ],
 )
-def test_a_text_that_is_not_toml_is_reported_with_advice(text: str | bytes, line: int, sentence: str) -> None:
+def test_invalid_toml_is_reported_with_advice(text: str | bytes, line: int, sentence: str) -> None:
     assert mistake(text) == (line, sentence)
 
 
@@ -196,12 +196,12 @@ def test_an_error_names_the_line_number_of_its_toml_key_in_any_layout(
     assert error.startswith(f"{tmp_path}/a.toml:{line}: " if line else f"{tmp_path}/a.toml: ")
 
 
-def test_a_toml_file_that_no_longer_exists_has_no_line_numbers(tmp_path: Path) -> None:
+def test_a_missing_toml_file_has_no_line_numbers(tmp_path: Path) -> None:
     assert line_numbers(tmp_path / "none.toml") == {}
     assert line_numbers(tmp_path) == {}
 
 
-def test_an_error_that_starts_with_a_key_has_its_line_number(tmp_path: Path) -> None:
+def test_an_error_that_starts_with_a_key_names_the_line_of_the_key(tmp_path: Path) -> None:
     (tmp_path / "a.toml").write_text("[a]\nb = 1\nc = 2\n")
     place = TomlPlace.in_file(tmp_path / "a.toml").within("[a]", "a")
     place.wrong("c = 2 is too much")

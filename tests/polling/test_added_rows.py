@@ -60,7 +60,7 @@ def of(rows: list[Row], register: str) -> list[Row]:
     return [row for row in rows if row.register == register]
 
 
-def test_a_channel_has_a_row_for_each_row_of_its_register(port: str) -> None:
+def test_a_computed_channel_has_a_row_for_each_row_of_its_register(port: str) -> None:
     rows = polled_rows(plant(line(port, pump(DOUBLE))))
     inputs, doubles = of(rows, "output_current"), of(rows, "double")
     value = proof(Toy(1), CURRENT)
@@ -70,7 +70,7 @@ def test_a_channel_has_a_row_for_each_row_of_its_register(port: str) -> None:
     ]
 
 
-def test_a_plant_without_channels_gets_the_batches_of_the_core_unchanged(port: str) -> None:
+def test_batches_of_the_core_stay_unchanged_in_a_plant_without_channels(port: str) -> None:
     with Poller(plant(line(port, pump()))) as poller:
         assert not poller._added
         until(lambda: (batch := poller.take()) and type(batch.parts()[0]).__name__ == "Columns")
@@ -135,7 +135,7 @@ def test_channel_totals_continue_after_a_change_to_another_plant(port: str) -> N
 
 @pytest.mark.long
 @patient
-def test_no_channel_combines_values_of_two_drives_with_the_same_name() -> None:
+def test_a_channel_ignores_values_of_an_earlier_drive_with_the_same_name() -> None:
     change = Channel("change", "derivative(output_current)", "A/s")
     values = [proof(Toy(address), CURRENT) for address in (1, 2)]
     assert values[0] != values[1]
@@ -157,7 +157,7 @@ def test_no_channel_combines_values_of_two_drives_with_the_same_name() -> None:
     assert {row.value for row in doubles if row.monotonic_ns < since_ns} == {2 * values[0]}
 
 
-def test_a_channel_uses_a_value_for_longer_if_its_register_is_polled_slowly(port: str) -> None:
+def test_a_channel_accepts_older_values_of_a_slowly_polled_register(port: str) -> None:
     with Poller(plant(line(port, pump(CHARGE)))) as poller:
         poller.set_rate("pump-1", "output_current", 60)
         assert poller._added._channels.holds_s == {("pump-1", "charge"): 180}
@@ -251,7 +251,7 @@ def test_an_outage_is_logged_without_a_row_if_no_status_code_is_free(
     assert "343 s without values" in caplog.text
 
 
-def test_a_removed_drive_is_freed_at_once() -> None:
+def test_the_memory_of_a_removed_drive_is_freed() -> None:
     """The memory of a poller does not grow if its drives change for years."""
     added = AddedRows(RowNames())
     removed = pump(CHARGE)

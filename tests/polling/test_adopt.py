@@ -214,7 +214,7 @@ def test_a_new_plant_adds_and_removes_lines() -> None:
         assert sorted(made.opened) == ["port of hall", "port of hall", "port of yard"]
 
 
-def test_every_poll_due_before_its_line_is_removed_has_a_row() -> None:
+def test_polls_due_before_the_removal_of_a_line_have_rows() -> None:
     with clocked(hall(*pumps()), yard(*fans())) as made:
         rows = made.run(2.05)
         made.poller.remove_line("yard")
@@ -325,7 +325,7 @@ def test_a_new_drive_expects_late_replies_of_the_drive_that_it_replaces() -> Non
 
 
 @pytest.mark.slow
-def test_an_absent_port_of_a_new_plant_is_opened_when_it_exists() -> None:
+def test_an_absent_port_of_a_new_plant_is_opened_once_it_appears() -> None:
     with clocked(hall(*pumps())) as made:
         made.run(1)
         del made.wires["port of yard"]
@@ -460,7 +460,7 @@ def test_an_object_that_is_not_a_plant_is_refused() -> None:
     poller.close()
 
 
-def test_rows_of_drives_that_swap_their_names_are_distinguished_by_time() -> None:
+def test_rows_are_distinguished_by_time_if_drives_swap_names() -> None:
     """Three drives on two lines swap their names. Each drive has a different value."""
     wires = {"port of hall": toys(), "port of yard": wire(*(Toy(address) for address in (5, 6)))}
 
@@ -512,7 +512,7 @@ def test_a_new_drive_with_a_used_name_has_its_own_statistics() -> None:
 
 
 @pytest.mark.slow
-def test_all_batches_of_a_poller_use_one_code_for_a_drive_name() -> None:
+def test_a_drive_name_keeps_its_code_in_all_batches() -> None:
     with clocked(hall(*pumps())) as made:
         made.run(1)
         meant: dict[int, str] = {}

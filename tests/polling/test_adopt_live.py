@@ -137,7 +137,7 @@ def test_motors_keep_running_when_their_line_is_removed(both: TwoLines) -> None:
     assert runs(both.fans[1])
 
 
-def test_a_drive_is_stopped_before_it_is_removed_with_stop_on_exit(both: TwoLines) -> None:
+def test_a_removed_drive_is_stopped_first_with_stop_on_exit(both: TwoLines) -> None:
     with Poller(plant(both.hall(), both.yard())) as poller:
         poller.stop_on_exit()
         for bus in poller.buses.values():
@@ -154,7 +154,7 @@ def test_a_drive_is_stopped_before_it_is_removed_with_stop_on_exit(both: TwoLine
     assert not runs(both.fans[1])
 
 
-def test_a_drive_that_is_being_removed_cannot_be_started_after_its_stop(both: TwoLines) -> None:
+def test_a_drive_cannot_be_started_during_its_removal(both: TwoLines) -> None:
     """Otherwise its motor would keep running, because no further stop is sent to a removed drive."""
     with Poller(plant(both.hall())) as poller:
         poller.stop_on_exit()
@@ -173,7 +173,7 @@ def test_a_drive_that_is_being_removed_cannot_be_started_after_its_stop(both: Tw
         assert not runs(both.pumps[2])
 
 
-def test_the_setting_stop_on_exit_applies_to_a_line_that_is_being_opened(
+def test_stop_on_exit_also_applies_to_a_line_during_its_opening(
     both: TwoLines, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with Poller(plant(both.hall())) as poller:
@@ -248,7 +248,9 @@ def waited_for(bus: Bus, monkeypatch: pytest.MonkeyPatch, drive: Drive | None = 
     return found
 
 
-def test_a_line_is_removed_only_after_its_stop(both: TwoLines, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_line_is_removed_only_after_a_running_stop_ends(
+    both: TwoLines, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with Poller(plant(both.hall(), both.yard())) as poller:
         bus = poller.bus("yard")
         bus.drives[0].start()
@@ -278,7 +280,9 @@ def test_a_drive_can_be_removed_while_another_drive_is_being_stopped(
         assert poller.bus("hall").drives == [pump_1]
 
 
-def test_replaced_drives_stay_attached_during_stops(both: TwoLines, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_drive_can_be_stopped_while_its_replacement_is_pending(
+    both: TwoLines, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The new drives have the names of the old ones, which can still be stopped."""
     replacements = [polled(QuickToy(address, name=f"pump-{address}", silence=0.01), []) for address in (1, 2)]
     with Poller(plant(both.hall())) as poller:
@@ -297,7 +301,7 @@ def test_replaced_drives_stay_attached_during_stops(both: TwoLines, monkeypatch:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("is_circle", [False, True])
-def test_a_drive_can_be_stopped_while_it_waits_for_its_new_name(
+def test_a_drive_can_be_stopped_while_its_renaming_is_pending(
     both: TwoLines, monkeypatch: pytest.MonkeyPatch, is_circle: bool
 ) -> None:
     """While `adopt` waits for a stop on the other line, the drive's motor can still be stopped."""

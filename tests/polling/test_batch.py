@@ -54,7 +54,7 @@ def test_the_method_at_returns_the_rows_at_the_given_indices(places: list[int]) 
     assert rows_of(pa.record_batch(found)) == wanted
 
 
-def test_columns_of_the_wide_table_in_a_list_raise_type_error() -> None:
+def test_a_list_of_wide_table_columns_raises_type_error() -> None:
     with pytest.raises(TypeError, match=r"wide takes column names as separate arguments, not \['"):
         example().wide(cast(Any, ["pump-1.speed"]))
 
@@ -80,7 +80,7 @@ def test_arrow_data_stays_valid_after_the_batch_is_deleted() -> None:
     assert values == [None if at % 10 == 9 else at for at in range(2000)]
 
 
-def test_arrow_shares_the_batch_s_memory() -> None:
+def test_arrow_shares_the_memory_of_a_batch() -> None:
     columns = Columns(1)
     assert add_rows(columns, block(0, 0), completion(1, first_ns=2, words=(100,)), 0)
     taken = pa.record_batch(Batch(columns, Names("a"), Names("b")))
@@ -194,7 +194,7 @@ def test_the_columns_stay_valid_after_their_batch_is_deleted() -> None:
     assert [list(view) for view in kept] == [[at] for at in range(200)]
 
 
-def test_a_name_added_later_does_not_change_earlier_codes() -> None:
+def test_a_new_name_does_not_change_the_columns_of_earlier_batches() -> None:
     names = Names(["a"])
     first = Batch(Columns(1), names, names).columns()
     assert names.number("b") == 1
@@ -322,7 +322,7 @@ def test_arrow_libraries_read_all_values_and_missing_values() -> None:
 
 
 @pytest.mark.slow
-def test_arrow_libraries_share_the_memory_of_a_pollers_numbers() -> None:
+def test_arrow_libraries_do_not_copy_numeric_columns() -> None:
     """No library copies the columns `value` and `monotonic_ns`. Only the names are created for Arrow."""
     polars = pytest.importorskip("polars", reason="needs polars")
     for batch in polled_batches():
@@ -497,7 +497,7 @@ def test_rows_after_a_restart_of_the_computer_are_last_in_the_wide_table() -> No
     assert table.column("pump.a").to_pylist() == [hour, hour + 100, hour + 200, 7.0, 9.0]
 
 
-def test_a_missing_value_replaces_no_value_in_the_wide_table() -> None:
+def test_a_missing_value_does_not_overwrite_a_value_in_the_wide_table() -> None:
     columns = Columns(4)
     assert add_rows(columns, block(0, 0), completion(SECOND, first_ns=SECOND, words=(100,)), UTC_0)
     assert add_miss(columns, block(0, 0), Status.NOT_ASKED, SECOND, UTC_0)

@@ -112,7 +112,7 @@ def test_the_removal_of_a_silent_drive_does_not_disturb_other_drives(port: str) 
         until(lambda: len(seen.of("pump-1")) > before + 50)
 
 
-def test_invalid_additions_and_removals_are_errors(port: str) -> None:
+def test_invalid_additions_and_removals_of_drives_raise_errors(port: str) -> None:
     with Poller(plant(line(port, pump(1)))) as poller:
         for polled_drive, sentence in (
             (pump(1, "other"), "address 1 is already used by pump-1"),
@@ -155,7 +155,7 @@ def test_every_call_of_a_detached_drive_raises_and_sends_nothing(port: str) -> N
 
 
 @pytest.mark.slow
-def test_a_drive_at_a_used_address_expects_late_replies_of_the_old_drive(port: str) -> None:
+def test_a_drive_at_a_reused_address_expects_the_old_drives_late_replies(port: str) -> None:
     with Bus(port) as bus:
         gone = bus.attach(Toy, address=9)
         with pytest.raises(NoReply):
@@ -211,7 +211,7 @@ def test_many_threads_can_read_poll_and_change_lines_concurrently() -> None:
     assert done.stdout.endswith("\nnothing misattributed, nothing lost, nothing grows\n")
 
 
-def test_statistics_can_be_read_while_drives_leave(port: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_statistics_can_be_read_while_drives_are_removed(port: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Reading statistics does not fail if another thread removes a drive at the same time."""
     with Bus(port) as bus:
         ours = [bus.attach(Toy, address=address, name=f"pump-{address}") for address in (1, 2)]
@@ -341,7 +341,7 @@ def test_registers_with_an_unchanged_rate_are_still_polled_on_time() -> None:
 
 
 @pytest.mark.long
-def test_a_change_of_rates_attributes_no_value_to_another_register() -> None:
+def test_values_stay_with_their_registers_when_rates_change() -> None:
     """Every value is of the right register, and each register has rows after each change."""
     chance = random.Random(7)
     drives = [polled(toy(address), ALL, 0.05) for address in (1, 2)]
@@ -401,7 +401,7 @@ def test_skipped_polls_stay_counted_after_a_change_of_the_rate() -> None:
     assert after >= before > 0
 
 
-def test_a_register_that_the_drive_refuses_is_still_skipped_at_a_new_rate() -> None:
+def test_a_refused_register_is_still_skipped_at_a_new_rate() -> None:
     pump = toy()
     with ClockedLines(
         ClockedWire([Picky(pump, {FAULT.address})], Faults()), [polled(pump, ALL, 0.1)]

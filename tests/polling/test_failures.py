@@ -150,7 +150,7 @@ def test_a_failing_line_is_retried_at_growing_intervals(
     assert delays[:6] == [0.005, 0.01, 0.02, 0.04, 0.08, 0.1]
 
 
-def test_a_request_that_was_queued_when_its_line_failed_is_sent(
+def test_a_queued_request_is_sent_after_a_failure_of_the_line(
     two: Two, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """If a line fails while it queues requests, the poller does not know how many requests are queued."""
@@ -349,13 +349,13 @@ class Waiting:
 @pytest.mark.parametrize(
     "function", [wait, give, give_later, Waiting(), partial(wait), partial(partial(give))]
 )
-def test_an_async_or_generator_function_is_refused_by_on_batch(two: Two, function: Any) -> None:
+def test_on_batch_refuses_async_and_generator_functions(two: Two, function: Any) -> None:
     with pytest.raises(TypeError, match="is async or a generator: a call would not run it"):
         two.poller.on_batch(function)
 
 
 @pytest.mark.parametrize("function", [wait, give, give_later])
-def test_a_lambda_that_calls_an_async_or_generator_function_fails_immediately(
+def test_on_batch_fails_if_a_lambda_returns_a_coroutine_or_generator(
     two: Two, function: Callable[[object], Any]
 ) -> None:
     two.poller.on_batch(lambda batch: function(batch))
@@ -478,7 +478,7 @@ def test_an_error_of_the_on_batch_function_is_logged_and_raised_once(
     poller.close()  # the failure is raised only once
 
 
-def test_an_exception_of_the_with_block_precedes_that_of_on_batch(
+def test_an_exception_in_the_with_block_hides_the_on_batch_error(
     poller: Poller, caplog: pytest.LogCaptureFixture
 ) -> None:
     def fail(batch: Batch) -> None:
@@ -509,7 +509,7 @@ def test_the_on_batch_function_may_close_the_poller(poller: Poller) -> None:
     until(lambda: len(rows) == counted(poller))  # the function gets the last rows after the poller is closed
 
 
-def test_batches_end_when_the_poller_is_closed(poller: Poller) -> None:
+def test_the_batches_loop_ends_when_the_poller_is_closed(poller: Poller) -> None:
     rows: list[Row] = []
 
     def take() -> None:
@@ -525,7 +525,7 @@ def test_batches_end_when_the_poller_is_closed(poller: Poller) -> None:
     assert len(rows) == counted(poller)
 
 
-def test_an_invalid_function_is_refused_by_on_batch(poller: Poller) -> None:
+def test_on_batch_refuses_an_invalid_function(poller: Poller) -> None:
     with pytest.raises(TypeError, match="on_batch takes a function with one argument, the batch, not 3"):
         poller.on_batch(3)  # type: ignore[arg-type]
     with poller:

@@ -96,7 +96,9 @@ STEPS = [*usually(STRIDE, 7), pytest.param(1, marks=NIGHTLY)]
         pytest.param("__exit__", 1, marks=NIGHTLY),
     ],
 )
-def test_a_second_close_completes_a_pollers_interrupted_close(hall: Received, step: int, end: str) -> None:
+def test_a_second_close_completes_an_interrupted_close_of_a_poller(
+    hall: Received, step: int, end: str
+) -> None:
     places: set[str] = set()
 
     def act(nth: int) -> bool:

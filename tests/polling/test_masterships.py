@@ -108,7 +108,7 @@ class Rows:
 
 @pytest.mark.slow
 @paces
-def test_a_plant_is_polled_only_by_the_lines_master(mastership: Mastership, every: float | None) -> None:
+def test_a_line_is_polled_only_by_the_master_process(mastership: Mastership, every: float | None) -> None:
     with lines(every) as (sims, made), Poller(plant(*made), mastership=mastership) as poller:
         rows = Rows(poller)
         rows.until("pump", NOT_MASTER)
@@ -133,7 +133,7 @@ def test_a_plant_is_polled_only_by_the_lines_master(mastership: Mastership, ever
 
 @pytest.mark.slow
 @paces
-def test_a_process_that_is_not_master_gets_few_rows(mastership: Mastership, every: float | None) -> None:
+def test_a_process_without_mastership_gets_few_rows(mastership: Mastership, every: float | None) -> None:
     """The poller must not run a busy loop while it is not the master."""
     with lines(every) as (_, made), Poller(plant(*made), mastership=mastership) as poller:
         Rows(poller).until("pump", NOT_MASTER)
@@ -146,7 +146,7 @@ def test_a_process_that_is_not_master_gets_few_rows(mastership: Mastership, ever
         assert 0 < found <= most
 
 
-def test_the_summary_without_a_mastership_has_no_count_of_foreign_bytes() -> None:
+def test_the_summary_has_no_foreign_bytes_without_a_mastership() -> None:
     with lines(None) as (_, made), Poller(plant(*made)) as poller:
         Rows(poller).settle("pump")
         assert "foreign_bytes" not in poller.summary()["lines"]["hall"]
@@ -266,7 +266,7 @@ def far() -> Iterator[Listener]:
 
 
 @pytest.mark.long
-def test_the_port_of_a_removed_line_is_closed_and_gets_no_byte(mastership: Mastership, far: Listener) -> None:
+def test_a_removed_lines_port_is_closed_and_receives_no_bytes(mastership: Mastership, far: Listener) -> None:
     hold(mastership)
     yard = line(far.url, quick("fan", 1, None), name="yard")
     with lines(0.02) as (_, (hall, _)), Poller(plant(hall), mastership=mastership) as poller:
@@ -339,7 +339,7 @@ def test_a_duplicate_or_unknown_line_name_raises_a_one_sentence_error(mastership
 
 
 @pytest.mark.slow
-def test_a_port_handled_by_pyserial_is_refused_and_changes_nothing(mastership: Mastership) -> None:
+def test_a_pyserial_port_is_refused_with_a_mastership(mastership: Mastership) -> None:
     hold(mastership)
     bridged = line("rfc2217://127.0.0.1:1", quick("fan", 1, None), name="yard")
     with pytest.raises(NoSuchPort, match="a port of this kind cannot be used with a mastership"):
@@ -368,7 +368,7 @@ def test_the_first_request_after_a_new_mastership_waits_the_guard_time(mastershi
 
 
 @pytest.mark.slow
-def test_a_port_opens_and_closes_without_a_pause(
+def test_network_ports_open_and_close_without_sleeping(
     mastership: Mastership, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """pyserial's own sockets sleep for 0.3 s when they are closed, which would take 19 s for 64 sockets."""
@@ -388,7 +388,7 @@ def test_a_port_opens_and_closes_without_a_pause(
     assert pauses_s == []
 
 
-def test_lines_that_are_removed_together_wait_for_each_request_in_flight(
+def test_the_removal_of_a_line_does_not_wait_for_another_lines_request(
     mastership: Mastership, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A gateway that loses its lease has only half a second to close all of its lines."""
@@ -429,7 +429,7 @@ class Busy:
 
 
 @table(("left_ns", "waited_ns"), [(0, S), (S // 5, S // 5), (-S, 0), (5 * S, S)])
-def test_a_closing_poller_waits_for_a_request_until_its_mastership_ends(
+def test_closing_waits_for_a_request_until_the_mastership_ends(
     monkeypatch: pytest.MonkeyPatch, left_ns: int, waited_ns: int
 ) -> None:
     """The mastership ends after `left_ns`; with 0 the process holds no mastership."""

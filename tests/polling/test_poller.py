@@ -329,7 +329,9 @@ PIECES = {  # further possible statuses, if this computer is too slow to deliver
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_each_fault_of_a_reply_gives_rows_with_its_status(fault: str, pump: SimulatedDrive) -> None:
+def test_each_kind_of_faulty_reply_gives_rows_with_a_specific_status(
+    fault: str, pump: SimulatedDrive
+) -> None:
     fate, said = FAULTS[fault]
     # A socket, because a pty's buffer is too small for the noise.
     wire = Faulty([pump], fate, unpaced=True, port="socket://127.0.0.1:0")
@@ -341,7 +343,7 @@ def test_each_fault_of_a_reply_gives_rows_with_its_status(fault: str, pump: Simu
 
 
 @pytest.mark.slow
-def test_a_drive_that_answers_every_second_request_has_half_its_values(pump: SimulatedDrive) -> None:
+def test_half_the_values_are_missing_if_every_second_reply_is_lost(pump: SimulatedDrive) -> None:
     turns = itertools.cycle([True, False])
     wire = Faulty([pump], lambda reply: reply if next(turns) else b"", unpaced=True)
     with Simulator([wire]) as sim, Polling(line(sim.wires[0].path, polled(drive(), ONE))) as polling:
@@ -352,7 +354,7 @@ def test_a_drive_that_answers_every_second_request_has_half_its_values(pump: Sim
 
 
 @pytest.mark.slow
-def test_a_silence_that_is_too_short_for_the_drive_loses_values() -> None:
+def test_values_are_missing_if_the_silence_is_too_short_for_the_drive() -> None:
     """The drive needs a longer silence, and appends a request that comes too soon to the previous frame."""
     strict = simulated(Brisk(1, name="pump-1"))
     strict.needs_silence = True
@@ -496,7 +498,7 @@ def test_a_slow_reopening_or_closing_does_not_delay_other_lines(
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_a_drive_that_returns_after_a_silence_is_polled_again(pump: SimulatedDrive) -> None:
+def test_polling_resumes_when_a_silent_drive_answers_again(pump: SimulatedDrive) -> None:
     other = simulated(drive(2, "pump-2"))
     asked = [polled(drive(), ONE), polled(drive(), READINGS[:1], 0.05), polled(drive(2, "pump-2"), ONE)]
     with Simulator([Wire([pump, other], unpaced=True)]) as sim:
@@ -561,7 +563,7 @@ def responder() -> Iterator[tuple[int, str]]:
 
 
 @pytest.mark.parametrize("every", [None, 1.0], ids=["in turn", "at a rate"])
-def test_a_poller_closes_only_after_the_exchanges_in_flight(
+def test_a_poller_closes_only_after_exchanges_in_flight_end(
     responder: tuple[int, str], every: float | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     master, path = responder
@@ -580,7 +582,7 @@ def test_a_poller_closes_only_after_the_exchanges_in_flight(
     polling.check()
 
 
-def test_a_request_without_reply_when_polling_ends_has_a_row(
+def test_an_unanswered_request_has_a_row_when_polling_ends(
     responder: tuple[int, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A queued poll has a row only if its period has already ended when polling ends."""
@@ -598,9 +600,7 @@ def test_a_request_without_reply_when_polling_ends_has_a_row(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("leaves", ["the poll", "the drive"])
-def test_a_poll_that_is_still_due_when_polling_ends_has_no_row(
-    responder: tuple[int, str], leaves: str
-) -> None:
+def test_a_due_but_unsent_poll_has_no_row_when_polling_ends(responder: tuple[int, str], leaves: str) -> None:
     """Such a poll is not counted as a missing value either."""
     master, path = responder
     first = polled(Patient(1, name="pump-1"), [Patient.fault], 60.0)
@@ -690,7 +690,7 @@ def test_a_recording_poller_of_31_drives_uses_at_most_30_mb() -> None:
 
 
 @pytest.mark.long
-def test_a_closing_poller_waits_for_all_stalled_adapters_together(
+def test_a_closing_poller_waits_once_for_all_stalled_adapters(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Each adapter has the same 0.75 s from the end of polling, not 0.75 s after the previous one."""

@@ -81,7 +81,7 @@ def test_one_refused_register_hardly_delays_its_neighbours(every: float | None) 
 
 
 @pytest.mark.slow
-def test_a_device_with_a_smaller_limit_is_read_in_smaller_blocks() -> None:
+def test_a_device_with_a_smaller_read_limit_gets_shorter_requests() -> None:
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive, most=8)
     with clocked_line_of(drive, sim) as clocked:
@@ -95,7 +95,7 @@ def test_a_device_with_a_smaller_limit_is_read_in_smaller_blocks() -> None:
 
 
 @pytest.mark.slow
-def test_a_split_block_is_read_as_a_whole_once_it_is_accepted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_split_request_is_merged_again_once_the_drive_accepts_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(refusals, "SET_ASIDE_NS", 2_000_000_000)
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive)
@@ -114,7 +114,7 @@ def test_a_split_block_is_read_as_a_whole_once_it_is_accepted(monkeypatch: pytes
 
 
 @pytest.mark.slow
-def test_a_retry_of_a_split_block_adds_no_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_retry_of_a_split_request_adds_no_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(refusals, "SET_ASIDE_NS", 1_000_000_000)
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive, most=12)
@@ -142,7 +142,7 @@ def test_a_device_that_ignores_long_requests_gets_shorter_ones(longest: int, eve
 
 
 @pytest.mark.long
-def test_a_drive_that_ignores_long_requests_is_not_polled_too_often() -> None:
+def test_extra_reads_stay_rare_if_a_drive_ignores_long_requests() -> None:
     """An additional read of a single register, with the period of the block, finds this out."""
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive, silent_beyond=1)
@@ -154,7 +154,7 @@ def test_a_drive_that_ignores_long_requests_is_not_polled_too_often() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("answered_s", [0, 3])
-def test_a_block_of_a_silent_drive_is_not_split(answered_s: int) -> None:
+def test_requests_to_a_silent_drive_are_not_split(answered_s: int) -> None:
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive)
     sim.deaf_until = 0.0 if answered_s else float("inf")
@@ -171,7 +171,7 @@ def test_a_block_of_a_silent_drive_is_not_split(answered_s: int) -> None:
 
 
 @pytest.mark.long
-def test_a_block_that_was_answered_before_is_not_split_if_the_drive_falls_silent() -> None:
+def test_a_previously_answered_request_is_not_split_if_the_drive_falls_silent() -> None:
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive)
     with ClockedLines(ClockedWire([sim], Faults()), [polled(drive, drive.registers.values())]) as clocked:
@@ -245,7 +245,7 @@ class Moody(SimulatedDrive):
 
 @table(("says", "is_set_aside"), [(Reason.BUSY, False), (Reason.READ_ADDRESS, True)], ids=["busy", "refused"])
 @table("registers", [[Toy.output_current, Toy.fault], [Toy.fault]], ids=["two", "one"])
-def test_a_block_that_becomes_readable_again_is_polled_as_before(
+def test_polling_recovers_when_refused_registers_become_readable(
     says: Reason, is_set_aside: bool, registers: list[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(refusals, "SET_ASIDE_NS", 1_000_000_000)
@@ -343,7 +343,7 @@ def test_polled_values_of_all_number_formats_are_correct() -> None:
     assert {row.status for row in last.values()} == {"ok"}
 
 
-def test_a_register_without_a_valid_value_gives_a_row_that_says_so() -> None:
+def test_an_invalid_value_gives_a_row_with_status_no_valid_value() -> None:
     sim = SimulatedDrive(Meter(1))
     sim["voltage"], sim["energy"], sim["probe"], sim["tariff"] = math.nan, None, None, None
     sim["power_scale"] = -32768
@@ -396,7 +396,7 @@ def registers_with_values(rows: list[Row]) -> set[str]:
     "name, refusal, lost",
     [("yaskawa-a1000", more_than_four, set()), ("delta-cp2000", at_210b, {"output_torque"})],
 )
-def test_a_refused_request_costs_only_the_values_of_refused_registers(
+def test_only_refused_registers_have_missing_values(
     name: str, refusal: Callable[[Message], int], lost: set[str]
 ) -> None:
     drive = shipped(name, 1)

@@ -150,9 +150,7 @@ def test_a_stop_reopens_a_port_between_two_attempts_of_the_poller(
 
 
 @pytest.mark.long
-def test_a_port_that_a_stop_has_reopened_is_not_dropped_as_lost(
-    hall: Plant, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_poller_keeps_a_port_that_a_stop_reopened(hall: Plant, monkeypatch: pytest.MonkeyPatch) -> None:
     """The poller may notice the loss of the earlier port just after a stop has reopened the port."""
     until(lambda: hall.port.is_lost)
     hall.stack.enter_context(hall.there())
@@ -229,7 +227,7 @@ class Scattered(Drive):
 @pytest.mark.long
 @table("every", [None, 0.1])
 @table("most", [1, 2, 3])
-def test_every_register_is_read_although_the_server_closes_connections_early(
+def test_every_register_is_read_if_the_server_closes_connections_early(
     every: float | None, most: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """An interrupted request is usually repeated first on the next connection."""
@@ -248,7 +246,7 @@ def test_every_register_is_read_although_the_server_closes_connections_early(
 
 
 @pytest.mark.usefixtures("_patient")
-def test_a_server_that_closes_idle_connections_costs_no_value() -> None:
+def test_no_value_is_lost_if_the_server_closes_idle_connections() -> None:
     """Reported as home-assistant/core#101982 and zivillian/esp32-modbus-gateway#2.
 
     On a busy machine the server may close late, after the next request. Only that request may fail.
@@ -314,7 +312,7 @@ class CheckedRTU(Checked):
 
 
 @pytest.mark.parametrize("is_polled", [False, True])
-def test_a_stop_is_sent_although_the_server_closes_the_connection_after_each_reply(is_polled: bool) -> None:
+def test_a_stop_is_sent_if_the_server_closes_the_connection_after_each_reply(is_polled: bool) -> None:
     """The check of the drive's family must not use up each new connection, and neither must polling."""
     drive = Checked(1, name="pump")
     with server(lambda nth, address: True) as port, ExitStack() as stack:
@@ -327,7 +325,7 @@ def test_a_stop_is_sent_although_the_server_closes_the_connection_after_each_rep
 
 
 @pytest.mark.parametrize("most", [1, 2])
-def test_a_stop_over_rtu_is_confirmed_although_the_server_closes_connections_early(most: int) -> None:
+def test_a_stop_over_rtu_is_confirmed_if_the_server_closes_connections_early(most: int) -> None:
     """On each new connection the confirmation may be an adapter's echo, until a read shows that it is not."""
     drive = CheckedRTU(1)
     with server(lambda nth, address: nth == most, framing=Framing.RTU) as port, Bus(port) as bus:
@@ -358,7 +356,7 @@ def test_a_stop_does_not_wait_for_the_poller_to_reopen_a_port(monkeypatch: pytes
             assert drive.stop(seconds=20).outcome is CommandOutcome.DONE
 
 
-def test_a_port_that_is_lost_at_every_request_is_reopened_twice_a_second(tmp_path: Path) -> None:
+def test_a_port_is_reopened_twice_a_second_if_every_request_loses_it(tmp_path: Path) -> None:
     """Some devices close each connection at its first request, while another client is connected."""
     drives = [Toy(address, name=f"pump-{address}") for address in range(1, 6)]
     port = str(tmp_path / "port")

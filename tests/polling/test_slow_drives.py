@@ -85,7 +85,8 @@ def test_a_line_is_checked_more_often_while_a_drive_is_silent(
 @pytest.mark.long
 @pytest.mark.story
 @pytest.mark.parametrize(("dead", "back_s"), [(1, 5), (5, 25), (10, 45)])
-def test_silent_drives_hardly_slow_the_others_and_return_soon(dead: int, back_s: int) -> None:
+def test_silent_drives_hardly_slow_the_other_drives(dead: int, back_s: int) -> None:
+    """Once they answer again, all of them are polled within `back_s` seconds."""
     drives = [InvtCHE(address, name=f"drive-{address}", baudrate=38_400) for address in range(1, DRIVES + 1)]
     sims = [simulated(drive) for drive in drives]
     clocked = ClockedLines(
@@ -222,7 +223,7 @@ def test_memory_is_bounded_if_a_response_delay_keeps_changing() -> None:
 
 
 @pytest.mark.slow
-def test_the_requests_to_a_drive_change_only_if_others_are_faster(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_read_plan_changes_only_if_another_plan_is_faster(monkeypatch: pytest.MonkeyPatch) -> None:
     """Measured delays always vary a little. That alone must not change the requests."""
     drive = Wide(1, name="pump-1")
     sim = SimulatedDrive(Wide(1), response_delay=SOON)
@@ -275,7 +276,7 @@ def quick(address: int) -> tuple[Drive, Picky]:
 @pytest.mark.long
 @table("every", [None, 0.01, 0.5])
 @table("others", [0, 2])
-def test_registers_of_a_drive_that_needs_pauses_are_polled_equally_often(
+def test_all_registers_are_polled_equally_often_if_the_drive_needs_pauses(
     every: float | None, others: int
 ) -> None:
     drive, sim = slow()
@@ -378,7 +379,7 @@ def test_the_predicted_rate_includes_the_interval_between_requests() -> None:
     assert not hasty.fits
 
 
-def test_all_requests_to_a_drive_that_needs_pauses_are_equally_frequent() -> None:
+def test_a_schedule_sends_all_requests_equally_often_if_a_drive_needs_pauses() -> None:
     """Takes ten thousand turns from a schedule, without a clock."""
     schedule: Schedule[Job] = Schedule()
     jobs = [Job(drive=1, period_ns=None, duration_ns=10, interval_ns=1000) for _ in range(5)]
@@ -399,7 +400,7 @@ def test_all_requests_to_a_drive_that_needs_pauses_are_equally_frequent() -> Non
     assert not [gap for (sooner, _), (later, _) in pairwise(taken) if (gap := later - sooner) != 10]
 
 
-def test_the_bus_cycle_is_not_repeated_while_a_drive_needs_pauses() -> None:
+def test_a_schedule_has_no_repeatable_cycle_if_a_drive_needs_pauses() -> None:
     schedule: Schedule[Job] = Schedule()
     first, second = (Job(drive=1, period_ns=None, duration_ns=10, interval_ns=1000) for _ in range(2))
     other = Job(drive=2, period_ns=None, duration_ns=10)
@@ -414,7 +415,7 @@ def test_the_bus_cycle_is_not_repeated_while_a_drive_needs_pauses() -> None:
     assert schedule.cycle(0) == [other]
 
 
-def test_a_removed_poll_is_not_sent_when_its_drive_may_be_asked_again() -> None:
+def test_a_poll_removed_during_its_drives_pause_is_never_sent() -> None:
     schedule: Schedule[Job] = Schedule()
     other = Job(drive=2, period_ns=None, duration_ns=10)
     first, second = (Job(drive=1, period_ns=None, duration_ns=10, interval_ns=1000) for _ in range(2))
@@ -440,7 +441,7 @@ def test_the_drive_whose_pause_ends_first_gets_the_next_request() -> None:
     assert [turn.job for turn in schedule.take(0, 0, 700, 9)] == [slow, fast, fast]
 
 
-def test_a_stop_waiting_for_its_drive_does_not_delay_another_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_pause_of_one_drive_does_not_delay_the_stop_of_another(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
     monkeypatch.setattr(clock, "now_ns", lambda: round(now[0] * 1e9))
     monkeypatch.setattr(clock, "sleep", lambda seconds: None)

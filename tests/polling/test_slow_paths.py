@@ -210,7 +210,7 @@ def test_the_reported_outcomes_of_writes_over_a_slow_path_are_true(
 
 
 @pytest.mark.parametrize("name", WRITTEN)
-def test_a_drive_may_answer_a_write_more_slowly_than_reads(
+def test_the_bus_waits_for_a_write_reply_that_is_slower_than_reads(
     name: str, path_of: PathOf, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Only the reply to the write is slow. The bus waits for it, and does not read the value back."""
@@ -333,7 +333,7 @@ def test_no_value_is_misattributed_over_a_stalled_gateway(story_of: type[Path]) 
 
 
 @pytest.mark.long
-def test_a_late_reply_recognised_by_its_id_delays_no_request() -> None:
+def test_a_late_tcp_reply_with_a_known_id_delays_no_request() -> None:
     """No request waits for a late reply, and no extra request is sent to prove that no late reply is due."""
     story = TrueIdsPath(two_of("innovert-ibd"), port=TCP)
     story.run_over(stalling(3.0))

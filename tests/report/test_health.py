@@ -58,9 +58,7 @@ def test_the_duration_of_a_recording_does_not_change_if_the_clock_is_set(
 
 
 @pytest.mark.parametrize("set_by_s", [0, -5, -3600])
-def test_a_fault_during_which_the_clock_is_set_back_has_the_right_duration(
-    tmp_path: Path, set_by_s: int
-) -> None:
+def test_the_duration_of_a_fault_is_right_if_the_clock_is_set_back(tmp_path: Path, set_by_s: int) -> None:
     """The fault lasts from 8 s to 13 s, and the clock is set at 10 s."""
     rows = []
     for at in range(30):
@@ -70,7 +68,7 @@ def test_a_fault_during_which_the_clock_is_set_back_has_the_right_duration(
     assert pump.faults() == [TimeSpan(UTC_0 + 8 * SECOND, UTC_0 + 13 * SECOND, "OVERHEAT")]
 
 
-def test_the_duration_of_a_recording_by_several_computers_is_by_the_time_of_day(tmp_path: Path) -> None:
+def test_a_recording_of_several_computers_is_timed_by_the_time_of_day(tmp_path: Path) -> None:
     rows = [
         Row(UTC_0 + at * SECOND, (uptime + at) * SECOND, 1000, drive, "speed", 1.0, "ok")
         for drive, uptime in (("pump", 100), ("fan", 3_000_000))
@@ -112,7 +110,7 @@ def test_missed_values_do_not_end_a_fault(look: Recording) -> None:
     assert (span.begin - UTC_0, span.end - UTC_0) == (40 * SECOND, 50 * SECOND)
 
 
-def test_faults_without_a_name_and_sets_of_fault_bits_are_shown(tmp_path: Path) -> None:
+def test_unnamed_faults_and_combined_fault_bits_are_shown(tmp_path: Path) -> None:
     flags = {"LOW": 1, "HIGH": 2, "HOT": 64}
     about = {"drives": {"pump": {"registers": {"fault": {"unit": "", "values": flags, "bits": True}}}}}
     rows = [row(at, "pump", "fault", value) for at, value in enumerate([0, 66, 66, 128, 0])]
@@ -123,7 +121,7 @@ def test_faults_without_a_name_and_sets_of_fault_bits_are_shown(tmp_path: Path) 
     ]
 
 
-def test_a_fault_number_without_a_name_is_not_shown_as_a_sum_of_faults(tmp_path: Path) -> None:
+def test_an_unnamed_fault_number_is_not_shown_as_a_sum_of_faults(tmp_path: Path) -> None:
     """The names of 8 and 16 must not be shown for 24."""
     series = load(record(tmp_path / "it.arrows", [row(0, "pump", "fault", 9 + 2)], ABOUT)).series[0]
     assert [series.name_of(count) for count in (8.0, 9.0, 24.0, 1e308, -1.0, 0.5)] == [
@@ -176,7 +174,7 @@ def test_the_response_delay_excludes_the_time_of_the_request(look: Recording) ->
     assert fan.quantile(1.0) == pytest.approx(0.021)
 
 
-def test_a_reply_that_may_answer_a_lost_request_has_no_response_delay(tmp_path: Path) -> None:
+def test_a_reply_after_a_lost_request_has_no_response_delay(tmp_path: Path) -> None:
     rows = [row(tick / 10, "pump", "fault", 0.0, ms=10.0) for tick in range(10)]
     rows += [row(1.0, "pump", "fault", None, "no reply"), row(1.0, "pump", "fault", 0.0, ms=488.0)]
     rows += [
@@ -219,7 +217,9 @@ def test_rare_reasons_for_missed_values_are_drawn_as_other_reasons(tmp_path: Pat
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_unpainted")
-def test_a_recording_gives_the_utilisation(planned: dict[str, Any], turns: list[Row], tmp_path: Path) -> None:
+def test_line_utilisation_is_computed_from_a_recording(
+    planned: dict[str, Any], turns: list[Row], tmp_path: Path
+) -> None:
     look = load(record(tmp_path / "it.arrows", turns, ABOUT | {"planned": planned}))
     (line,) = line_uses(look)
     # Pump: 14 ms from the request to the reply's first character, and 8 ms for the reply's other characters.
@@ -264,7 +264,7 @@ def test_an_invalid_plan_in_a_recording_is_ignored(turns: list[Row], tmp_path: P
     assert line_uses(look) == []
 
 
-def test_the_plan_in_a_recording_equals_the_polled_blocks(tmp_path: Path) -> None:
+def test_the_plan_in_a_recording_equals_the_polled_requests(tmp_path: Path) -> None:
     path = tmp_path / "hall.toml"
     path.write_text(
         '[[line]]\nname = "hall-1"\nport = "x"\n[[line.drive]]\nname = "pump"\naddress = 1\nevery = "1 s"\n'

@@ -72,7 +72,7 @@ def test_drive_names_in_any_alphabet_are_drawn(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_recording_of_misses_only_has_a_report(tmp_path: Path) -> None:
+def test_a_recording_without_values_has_a_report(tmp_path: Path) -> None:
     rows = [row(at, "pump", "output_frequency", None, "no reply") for at in range(3)]
     look = load(record(tmp_path / "it.arrows", rows))
     page = report_page(look)

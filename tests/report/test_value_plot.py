@@ -75,7 +75,7 @@ def test_a_plot_can_be_limited_to_some_drives_and_registers(look: Recording) -> 
     assert "output_frequency, Hz" in [axes.get_title(loc="left") for axes in figure.axes]
 
 
-def test_without_a_fault_no_panel_of_faults_is_drawn_unless_requested(tmp_path: Path) -> None:
+def test_an_empty_fault_panel_is_drawn_only_on_request(tmp_path: Path) -> None:
     rows = [row(at, "pump", name, 0) for at in range(3) for name in ("fault", "output_frequency")]
     look = load(record(tmp_path / "it.arrows", rows))
 
@@ -86,7 +86,7 @@ def test_without_a_fault_no_panel_of_faults_is_drawn_unless_requested(tmp_path: 
     assert titles(["fault"]) == ["faults: none"]
 
 
-def test_a_fault_is_shaded_if_its_drive_is_plotted_alone(tmp_path: Path) -> None:
+def test_a_fault_is_shaded_in_the_panels_of_the_faulty_drive(tmp_path: Path) -> None:
     units = {"output_frequency": "Hz", "output_current": "A", "output_torque": "%"}
     meanings = {name: {"unit": unit} for name, unit in units.items()}
     status = {"status": {"unit": "", "values": {"RUN": 1}, "bits": False}}
@@ -110,7 +110,7 @@ def test_a_fault_is_shaded_if_its_drive_is_plotted_alone(tmp_path: Path) -> None
     }
 
 
-def test_drawn_curves_and_states_end_at_a_pause_of_polling(tmp_path: Path) -> None:
+def test_plotted_curves_break_at_a_pause_of_polling(tmp_path: Path) -> None:
     """A suspended process records no rows, not even misses: that is a pause. A changed rate is not."""
     times = [0.0, 0.1, 0.2, 10.2, 10.3, 10.4, 30.4, 50.4, 70.4]
     rows = [row(at, "pump", name, 1.0) for at in times for name in ("output_frequency", "status")]
@@ -143,7 +143,7 @@ def test_a_long_legend_takes_no_room_from_the_plot(tmp_path: Path, drives: int, 
     assert shown.x1 <= figure.bbox.width
 
 
-def test_the_value_axis_around_a_constant_value_is_wide(tmp_path: Path) -> None:
+def test_the_value_axis_of_a_constant_value_includes_zero(tmp_path: Path) -> None:
     rows = [row(at, "pump", "output_frequency", 50.0) for at in range(3)]
     (axes,) = plot(load(record(tmp_path / "it.arrows", rows)))[0].axes
     low, high = axes.get_ylim()
@@ -245,7 +245,7 @@ def test_each_bit_of_a_status_register_is_drawn_in_its_own_row(tmp_path: Path) -
 
 
 @pytest.mark.slow
-def test_states_that_change_too_fast_to_be_drawn_hide_no_fault(tmp_path: Path) -> None:
+def test_fast_state_changes_do_not_hide_a_fault_in_a_plot(tmp_path: Path) -> None:
     rows = [row(at / 100, "che", "status", 1 + at % 2) for at in range(20_000)]
     rows[10_001] = row(100.01, "che", "status", 4)
     (axes,) = plot(states(tmp_path, rows))[0].axes
@@ -255,7 +255,7 @@ def test_states_that_change_too_fast_to_be_drawn_hide_no_fault(tmp_path: Path) -
 
 
 @pytest.mark.long
-def test_rows_of_states_that_do_not_fit_into_a_plot_are_counted(tmp_path: Path) -> None:
+def test_state_rows_omitted_from_a_plot_are_counted(tmp_path: Path) -> None:
     bits = {f"B{bit}": 1 << bit for bit in range(16)}
     drives = [f"yd{number}" for number in range(80)]
     meaning = {"unit": "", "values": bits, "bits": True}
@@ -267,7 +267,8 @@ def test_rows_of_states_that_do_not_fit_into_a_plot_are_counted(tmp_path: Path) 
     assert "(16 more lanes: choose with --drive)" in axes.get_title(loc="left")
 
 
-def test_a_plot_counts_drives_that_do_not_fit_and_tables_list_them(tmp_path: Path) -> None:
+def test_drives_omitted_from_a_plot_are_counted(tmp_path: Path) -> None:
+    """The tables of a report list all drives."""
     rows = [row(at, f"pump-{number}", "x", at) for at in range(2) for number in range(MOST_DRIVES + 2)]
     look = load(record(tmp_path / "it.arrows", rows, {}))
     assert plot(look)[1] == ["2 more drives"]
@@ -280,7 +281,7 @@ def test_a_plot_counts_drives_that_do_not_fit_and_tables_list_them(tmp_path: Pat
 @pytest.mark.usefixtures("_unpainted")
 @pytest.mark.slow
 @pytest.mark.long
-def test_series_that_do_not_fit_into_the_picture_are_named(run: Run, tmp_path: Path) -> None:
+def test_series_omitted_from_a_plot_are_named(run: Run, tmp_path: Path) -> None:
     rows = [row(at, "pump", f"r{number}", at) for at in range(3) for number in range(MOST_PANELS + 2)]
     look = load(record(tmp_path / "it.arrows", rows))
     figure, left = plot(look)

@@ -195,7 +195,7 @@ def test_a_plant_with_a_drive_named_test_is_refused(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_a_test_that_is_too_fast_is_reported_with_a_possible_speed(
+def test_a_test_file_too_fast_for_the_line_is_reported_with_a_correction(
     line: str, keys: dict[str, str], sentence: str, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     plan = load_test(write_test(tmp_path_factory.mktemp("misfit"), line, fan=CHE | keys))
@@ -204,7 +204,7 @@ def test_a_test_that_is_too_fast_is_reported_with_a_possible_speed(
     assert "would fit with" in found
 
 
-def test_the_default_silence_limit_exceeds_the_fault_codes_period() -> None:
+def test_the_default_silence_limit_exceeds_the_polling_period_of_faults() -> None:
     fan = find_model("invt-che")(1, maximum_frequency=50, name="fan")
     polled = PolledDrive(fan, ["output_frequency", Polled(fan.register("fault"), 2.0)])
     plant = Plant([PlantLine("hall", "nowhere", drives=[polled])])
@@ -310,7 +310,7 @@ def test_missing_values_of_a_fault_code_are_reported(watch: LimitWatch) -> None:
     assert watch.silent(5 * S) == "no value of pump.fault came for 3.0 s"
 
 
-def test_a_drive_counts_as_silent_although_its_channel_has_values(watch: LimitWatch) -> None:
+def test_computed_channels_do_not_hide_a_silent_drive(watch: LimitWatch) -> None:
     watch.add([row("fan", "output_current", 1.0, 3.0), row("pump", "power_of_all", 1.0, 3.0)])
     assert watch.silent(3 * S) == "no value of pump came for 3.0 s"
 

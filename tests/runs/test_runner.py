@@ -156,7 +156,7 @@ def test_an_abort_stops_all_drives_and_says_why(kind: str, tmp_path: Path) -> No
         assert turning(sims) == []
 
 
-def test_a_test_run_whose_steps_would_wear_eeprom_is_refused() -> None:
+def test_a_test_run_is_refused_if_its_steps_would_wear_eeprom() -> None:
     mixer = PolledDrive(DelixiModbus(1, framing="rtu", name="mixer"), ["output_frequency"])
     plan = RunPlan(Plant([PlantLine("hall", "nowhere", drives=[mixer])]), [RunStep("a", {"mixer": 10.0})])
     with pytest.raises(WriteForbidden, match="EEPROM, which steps would wear out"):
@@ -170,7 +170,7 @@ def test_a_test_run_whose_steps_would_wear_eeprom_is_refused() -> None:
         (RunStep("b", {"fan": 9.0}, rate=1.0, start=("fan",)), "b: fan cannot be started by a ramp"),
     ],
 )
-def test_a_step_whose_commands_contradict_each_other_is_refused(step: RunStep, sentence: str) -> None:
+def test_contradictory_commands_in_a_step_are_refused(step: RunStep, sentence: str) -> None:
     fan = PolledDrive(InvtCHE(1, maximum_frequency=50, name="fan"), ["output_frequency"])
     plant = Plant([PlantLine("hall", "nowhere", drives=[fan])])
     with pytest.raises(ValueError, match=sentence):
@@ -232,7 +232,8 @@ class HangingWriter:
 LIMIT = 'limits = ["fan.output_current > 30"]'
 
 
-def test_a_hanging_disk_prevents_no_abort_and_loses_no_row(tmp_path: Path) -> None:
+def test_an_abort_does_not_wait_for_a_hanging_disk(tmp_path: Path) -> None:
+    """All rows are written once the disk continues."""
     disk, poller = HangingWriter(), FixedPoller(1.0, 31.0)
     found = session(tmp_path, LIMIT, poller, writer=disk)
     found._mark("start")
@@ -274,7 +275,7 @@ def test_an_exception_in_a_callback_for_rows_ends_the_run(tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-def test_no_step_is_shortened_by_a_delay_of_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_delay_of_the_run_does_not_shorten_a_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: dict[str, float] = {}
     original = LimitWatch.add
 
@@ -397,7 +398,7 @@ def test_a_failed_command_aborts_before_any_later_step(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("is_real", [False, True])
-def test_a_busy_computer_aborts_only_the_run_of_a_real_drive(
+def test_expired_commands_abort_only_the_run_of_a_real_drive(
     is_real: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The first three attempts of the first command expire, as on a busy computer."""
@@ -616,7 +617,7 @@ YARD = '[[line]]\nname = "yard"\nport = "{folder}/yard"\n' + "".join(
 @patient
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", CAUSES)
-def test_the_first_stop_of_each_kind_of_abort_comes_within_two_bus_cycles(
+def test_each_kind_of_abort_sends_the_first_stop_within_two_bus_cycles(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     limits, step, event, reason = CAUSES[kind]
