@@ -472,7 +472,7 @@ def test_arrow_files_with_compressed_batches_are_refused(tmp_path: Path) -> None
     table = pa.table(counting(2000))
     with pa.ipc.new_stream(path, table.schema, options=pa.ipc.IpcWriteOptions(compression="zstd")) as stream:
         stream.write_table(table)
-    with pytest.raises(ValueError, match="compressed: only pyarrow and polars can read them"):
+    with pytest.raises(ValueError, match="compressed: only pyarrow and polars can read it"):
         recorded(path)
 
 

@@ -240,7 +240,7 @@ class InnovertIBD(Drive):
 
     @classmethod
     def role_mistakes(cls, own: Mapping[str, Any]) -> list[str]:
-        """Return a sentence for each of these registers whose value may be 0 although its count is not 0."""
+        """Return a mistake for each register of OF_STATE that could show 0 while its raw count is not 0."""
         found = {name: own[name] for name in OF_STATE if isinstance(own.get(name), Register)}
         return [
             f"{name}: it is 0 only {meaning}, so it cannot have a part, offset or scale_register{codes}"
