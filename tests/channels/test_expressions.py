@@ -15,9 +15,9 @@ import pytest
 from tables import table
 
 from multidrop.channels import Channel, DriveSeries
-from multidrop.channels.functions import unit_of
 from multidrop.channels.grammar import MOST_CHARACTERS, ExpressionError, parse
 from multidrop.channels.program import Program, SeriesTable
+from multidrop.channels.units import unit_of
 
 POLLED = {
     "frequency": ("Hz", 1.0),

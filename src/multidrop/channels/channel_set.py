@@ -6,9 +6,10 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from math import isfinite
 from typing import Any, NamedTuple
 
-from multidrop.channels.functions import Value, unit_of
+from multidrop.channels.functions import Value
 from multidrop.channels.grammar import ExpressionError
 from multidrop.channels.program import Channel, DriveSeries, Program, SeriesTable
+from multidrop.channels.units import unit_of
 from multidrop.core import Status
 
 MOST_CHANNELS = 1000  # limit of channels in a plant

@@ -8,19 +8,7 @@ from functools import cached_property
 from math import isfinite
 from typing import Any, NamedTuple
 
-from multidrop.channels.functions import (
-    AS,
-    FUNCTIONS,
-    MEMORIES,
-    NAMES,
-    TABLE,
-    Curve,
-    StatefulFunction,
-    Value,
-    ValueUnit,
-    misspelled_unit,
-    unit_of,
-)
+from multidrop.channels.functions import AS, FUNCTIONS, MEMORIES, NAMES, TABLE, Curve, StatefulFunction, Value
 from multidrop.channels.grammar import (
     CallStep,
     ExpressionError,
@@ -30,6 +18,7 @@ from multidrop.channels.grammar import (
     TextStep,
     parse,
 )
+from multidrop.channels.units import ValueUnit, misspelled_unit, unit_of
 from multidrop.core.columns import NumberFormat
 from multidrop.drive.register import Access, Register
 from multidrop.drive.register import Table as AddressTable

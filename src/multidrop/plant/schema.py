@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from multidrop.channels.functions import KNOWN_UNITS, SECOND, unit_of
+from multidrop.channels.units import KNOWN_UNITS, SECOND, unit_of
 from multidrop.core import Framing
 from multidrop.drive import Kept
 from multidrop.drive.family import Drive
