@@ -27,8 +27,9 @@ from multidrop.drive.number_format import FLOATS
 from multidrop.drive.register import Register, row_field
 from multidrop.drive.text import Text
 from multidrop.errors import NotAttached
-from multidrop.planning.blocks import Block, blocks, may_be_too_long, proofs
+from multidrop.planning.blocks import Block, blocks, may_be_too_long
 from multidrop.planning.bus_time import silence
+from multidrop.planning.proofs import proofs
 from multidrop.transport import clock, port_identity
 from multidrop.transport.line import Line
 
