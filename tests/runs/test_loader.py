@@ -14,7 +14,8 @@ from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
 from multidrop.polling.batch import Row
 from multidrop.runs import RunPlan, RunStep, load_test, loader
 from multidrop.runs.checks import misfits, silence_of
-from multidrop.runs.model import LimitWatch, length, timeline
+from multidrop.runs.model import length, timeline
+from multidrop.runs.watch import LimitWatch
 
 EEPROM = {"model": "delixi-modbus", "framing": "rtu", "poll": ["output_frequency"]}
 

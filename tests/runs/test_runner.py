@@ -36,8 +36,8 @@ from multidrop.polling.added_rows import AddedRow, JoinedColumns
 from multidrop.polling.batch import Batch, Rows
 from multidrop.recording import open_recording
 from multidrop.runs import RunPlan, RunResult, RunStep, TestRun, load_test, runner
-from multidrop.runs.model import LimitWatch
 from multidrop.runs.runner import _Session
+from multidrop.runs.watch import LimitWatch
 from multidrop.sim import MotorDrive, Simulator, Wire, simulated
 from multidrop.sim.drive import Reason, Refusal
 from multidrop.sim.memory import MemoryCell

@@ -31,7 +31,8 @@ from multidrop.recording import RecordingWriter, open_writer
 from multidrop.recording.rows import phase_row, with_phases
 from multidrop.runs.checks import RAMP_EVERY_S, check_step, misfits, silence_of
 from multidrop.runs.loader import STOP, load_test
-from multidrop.runs.model import LimitWatch, RunPlan, RunStep, timeline
+from multidrop.runs.model import RunPlan, RunStep, timeline
+from multidrop.runs.watch import LimitWatch
 from multidrop.transport import clock
 from multidrop.transport.port_identity import is_simulated
 
