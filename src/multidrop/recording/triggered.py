@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
 
-from multidrop.plant.model import TriggerSeries
+from multidrop.plant.triggers import TriggerSeries
 from multidrop.polling.added_rows import EVENT, TRIGGER
 from multidrop.polling.batch import Batch, Rows, copied
 from multidrop.recording import open_writer

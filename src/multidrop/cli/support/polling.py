@@ -20,16 +20,8 @@ from multidrop.cli.support.values import columns_of, padded, value_text
 from multidrop.core import UNASKED, Counters
 from multidrop.drive.known_state import StateReader
 from multidrop.drive.state import Condition, Direction
-from multidrop.plant.model import (
-    POST_S,
-    PRE_S,
-    Plant,
-    PlantLine,
-    PolledDrive,
-    TriggerSeries,
-    current_for,
-    with_triggers,
-)
+from multidrop.plant.model import Plant, PlantLine, PolledDrive, current_for
+from multidrop.plant.triggers import POST_S, PRE_S, TriggerSeries, with_triggers
 from multidrop.poller import Poller
 from multidrop.polling.batch import Row, Rows
 from multidrop.recording import FORMATS, open_recording, open_writer
