@@ -18,7 +18,8 @@ from time import monotonic
 from typing import Self
 
 from multidrop.core.process import register_at_fork, undisturbed
-from multidrop.sim.wire import SimulatedEnd, Wire
+from multidrop.sim.port import SimulatedEnd
+from multidrop.sim.wire import Wire
 
 _log = logging.getLogger("multidrop.sim")
 
