@@ -192,39 +192,37 @@ static int is_overtaken(const struct md_turn *turn)
 
 static int is_silent(const struct md_exchange *exchange)
 {
-    return __atomic_load_n(&exchange->drive->failures, __ATOMIC_RELAXED) > 0;
+    return exchange->drive->failures > 0;
 }
 
-/* Move the first of these requests that may be sent now to the front and return it; otherwise set wake_ns.
- * While a stop waits for its drive, send only other stops: the stop must not wait for further exchanges. */
-static struct md_urgent *find_among(struct md_turn *turn, int only_answering, int *is_held, int64_t *wake_ns,
-                                    int64_t now_ns)
-{
-    for (struct md_urgent **at = &turn->urgent; *at; at = &(*at)->next) {
-        struct md_urgent *urgent = *at;
-        if (only_answering && (!urgent->exchange->insists || is_silent(urgent->exchange)))
-            continue;
-        if (*is_held && !urgent->exchange->insists)
-            return NULL;
-        if (is_time(later(urgent->not_before_ns, ready_ns(urgent->exchange)), wake_ns, now_ns)) {
-            *at = urgent->next;
-            urgent->next = turn->urgent;
-            turn->urgent = urgent;
-            return urgent;
-        }
-        *is_held |= urgent->exchange->insists;
-    }
-    return NULL;
-}
-
-/* Find the next request as find_among() does. After an exchange with a silent drive, stops of drives that
- * answer go first: they would otherwise wait for the timeouts of all silent drives that are being stopped. */
+/* Move the first request that may be sent now to the front and return it; otherwise set wake_ns. While a stop
+ * waits for its drive, send only other stops: the stop must not wait for further exchanges. After an exchange
+ * with a silent drive, a stop of a drive that answers precedes the other requests: it would otherwise wait
+ * for the timeouts of all silent drives that are being stopped. */
 static struct md_urgent *find_urgent(struct md_turn *turn, int *is_held, int64_t *wake_ns, int64_t now_ns)
 {
-    struct md_urgent *urgent = NULL;
-    if (turn->was_silent)
-        urgent = find_among(turn, 1, is_held, wake_ns, now_ns);
-    return urgent ? urgent : find_among(turn, 0, is_held, wake_ns, now_ns);
+    struct md_urgent **found = NULL;
+    for (struct md_urgent **at = &turn->urgent; *at; at = &(*at)->next) {
+        const struct md_exchange *exchange = (*at)->exchange;
+        int is_preferred = !turn->was_silent || (exchange->insists && !is_silent(exchange));
+        if (!exchange->insists && (found || *is_held))
+            break;
+        if (!is_time(later((*at)->not_before_ns, ready_ns(exchange)), wake_ns, now_ns)) {
+            *is_held |= exchange->insists;
+            continue;
+        }
+        if (is_preferred || !found)
+            found = at;
+        if (is_preferred)
+            break;
+    }
+    struct md_urgent *urgent = found ? *found : NULL;
+    if (urgent) {
+        *found = urgent->next;
+        urgent->next = turn->urgent;
+        turn->urgent = urgent;
+    }
+    return urgent;
 }
 
 /* ---- polling ---- */
@@ -348,6 +346,18 @@ static void step_back(struct md_turn *turn)
         turn->round_at = (turn->round_at ? turn->round_at : turn->round_len) - 1;
 }
 
+/* Put the latest exchange back into its queue: an urgent one behind the stops that came since. */
+static void put_back(struct md_turn *turn, int source)
+{
+    if (source == MD_URGENT) {
+        struct md_urgent *urgent = turn->urgent;
+        turn->urgent = urgent->next;
+        md_turn_add_urgent(turn, urgent);
+    } else if (source == MD_REPEATED) {
+        step_back(turn);
+    }
+}
+
 static void finish(struct md_turn *turn)
 {
     int source = turn->source;
@@ -364,8 +374,7 @@ static void finish(struct md_turn *turn)
         return;
     int goes_on = !turn->progress.lost && (source == MD_URGENT || !turn->is_ending);
     if (is_again(&turn->before, turn->line.exchange, turn->line.completion) && goes_on) {
-        if (source == MD_REPEATED)
-            step_back(turn);
+        put_back(turn, source);
         return;
     }
     if (source == MD_URGENT) {
@@ -390,13 +399,7 @@ static void give_way(struct md_turn *turn)
     int source = turn->source;
     md_line_put_back(&turn->line);
     turn->source = MD_NO_SOURCE;
-    if (source == MD_URGENT) {
-        struct md_urgent *urgent = turn->urgent;
-        turn->urgent = urgent->next;
-        md_turn_add_urgent(turn, urgent);
-    } else if (source == MD_REPEATED) {
-        step_back(turn);
-    }
+    put_back(turn, source);
 }
 
 int md_turn_want(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)

@@ -312,6 +312,27 @@ def test_only_reads_are_repeated_if_the_reply_may_be_late(drive: Peer, asked: Me
     assert drive.exchanges == times
 
 
+def test_a_stop_precedes_the_repetition_of_a_read(drive: Peer) -> None:
+    """Otherwise the stop would also wait for the proof that precedes the repetition."""
+    drive.prove_by([exchange(LONGER, drive)])
+    drive.doubt_first_reply()
+    slots, turn = ffi.new("struct md_slot[]", 1), ffi.new("struct md_turn *")
+    wake, found = ffi.new("int64_t *"), ffi.new("struct md_completion *")
+    asked, stop = exchange(READ, drive), exchange(WRITE, drive, insists=True)
+    urgent = ffi.new("struct md_urgent *", {"exchange": asked.c, "completion": found})
+    stopping = ffi.new("struct md_urgent *", {"exchange": stop.c, "completion": found})
+    lib.md_turn_init(turn, slots, 1, 0)
+    lib.md_turn_add_urgent(turn, urgent)
+    line = ffi.addressof(turn.line)
+    while lib.md_turn_want(turn, wake, wake[0]) != lib.MD_WRITE:
+        pass
+    lib.md_line_sent(line, line.tx_len, wake[0], wake[0])
+    lib.md_turn_add_urgent(turn, stopping)
+    lib.md_line_received(line, reply(), len(reply()), wake[0])
+    lib.md_turn_want(turn, wake, wake[0])
+    assert line.exchange == stop.c
+
+
 def test_no_late_reply_is_expected_if_the_request_was_not_sent(line: LineDriver, drive: Peer) -> None:
     line.begin(exchange(READ, drive))
     line.lose(0)
