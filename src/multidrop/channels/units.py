@@ -90,7 +90,7 @@ _POWER = re.compile(r"([^\W\d]+)([23²³])")
 _EXPONENTS = {"2": 2, "3": 3, "²": 2, "³": 3}
 
 
-KNOWN_UNITS = tuple(_KNOWN)  # their texts
+KNOWN_UNITS = tuple(_KNOWN)
 
 
 @lru_cache(maxsize=1024)
@@ -123,7 +123,8 @@ def _unit(text: str, name: str) -> ValueUnit:
     return ValueUnit(text, factor, tuple(sorted(exponents.items())))
 
 
-_OTHER_UNITS = frozenset({"nm", "kn"})  # nanometre and knot, which are no misspelled Nm and kN
+# nanometre, knot, siemens and molar, which are not misspelled Nm, kN, ms, us and mm
+_OTHER_UNITS = frozenset({"nm", "kn", "mS", "uS", "mM"})
 
 
 def misspelled_unit(text: str) -> str:
@@ -135,7 +136,8 @@ def misspelled_unit(text: str) -> str:
         if name in _KNOWN or name in _OTHER_UNITS or len(name) < 2:
             continue
         for known in KNOWN_UNITS:
-            is_prefix = {known[:1], name[0]} == {"m", "M"} and known[1:] in _KNOWN  # mW and MW are two units
+            # milli and mega are different units, such as mW and MW
+            is_prefix = known[:1] in "mM" and known[1:] == name[1:] in _KNOWN
             if known.lower() == name.lower() and not is_prefix:
                 return f'the unit {name} is not known; did you mean "{known}"?'
     return ""
