@@ -100,9 +100,8 @@ def test_every_poll_is_sent_on_an_overloaded_line() -> None:
     made = schedule(*turn, *fast, *slow)
     done = carry_out(made, 100)
     counts = {each: sum(1 for other, _, _ in done if other is each) for each in made.jobs}
-    assert [counts[each] for each in slow] == pytest.approx(
-        [100, 100], abs=1
-    )  # no poll of a slow job is skipped
+    # no poll of a slow job is skipped
+    assert [counts[each] for each in slow] == pytest.approx([100, 100], abs=1)
     assert max(counts[each] for each in fast) - min(counts[each] for each in fast) <= 2
     assert sum(counts[each] for each in turn) / len(done) == pytest.approx(TURN_SHARE, abs=0.002)
     assert abs(counts[turn[0]] - counts[turn[1]]) <= 1

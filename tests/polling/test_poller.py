@@ -343,7 +343,7 @@ def test_each_kind_of_faulty_reply_gives_rows_with_a_specific_status(
 
 
 @pytest.mark.slow
-def test_half_the_values_are_missing_if_every_second_reply_is_lost(pump: SimulatedDrive) -> None:
+def test_values_are_still_read_if_every_second_reply_is_lost(pump: SimulatedDrive) -> None:
     turns = itertools.cycle([True, False])
     wire = Faulty([pump], lambda reply: reply if next(turns) else b"", unpaced=True)
     with Simulator([wire]) as sim, Polling(line(sim.wires[0].path, polled(drive(), ONE))) as polling:

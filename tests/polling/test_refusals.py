@@ -143,7 +143,7 @@ def test_a_device_that_ignores_long_requests_gets_shorter_ones(longest: int, eve
 
 @pytest.mark.long
 def test_extra_reads_stay_rare_if_a_drive_ignores_long_requests() -> None:
-    """An additional read of a single register, with the period of the block, finds this out."""
+    """The poller then also reads a single register, with the period of the block."""
     drive = family(WIDE)(1, name="pump-1")
     sim = Picky(drive, silent_beyond=1)
     with clocked_line_of(drive, sim, every=5.0) as clocked:

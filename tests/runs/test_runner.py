@@ -736,9 +736,8 @@ def test_no_motor_keeps_running_after_a_port_was_lost(seed: int, tmp_path: Path)
     has_ended = threading.Event()
 
     def lose() -> None:
-        until(
-            lambda: sims[0].motor.energised or has_ended.is_set()
-        )  # on a busy machine, the run may be aborted before the start
+        # on a busy machine, the run may be aborted before the start
+        until(lambda: sims[0].motor.energised or has_ended.is_set())
         time.sleep(chance.uniform(0.0, 1.0))
         first.__exit__(None, None, None)
         time.sleep(chance.uniform(0.2, 2.0))

@@ -263,7 +263,7 @@ def test_a_message_of_huge_size_is_not_unpacked(compression: str, most_allocated
 
 @pytest.mark.slow
 @pytest.mark.parametrize("column", OF_ONE_TEXT)
-def test_a_column_that_repeats_one_long_text_is_not_unpacked(
+def test_a_column_that_repeats_one_value_is_not_unpacked(
     column: str, most_allocated: Callable[[], int]
 ) -> None:
     rows = 30_000

@@ -313,7 +313,7 @@ def test_a_full_disk_removes_forwarded_messages_first(folder: Path, monkeypatch:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("acknowledged", "left"), [(None, [1, 2, 3]), (0, [1, 2, 3]), (1, [2, 3]), (3, [3])])
-def test_only_old_sent_messages_are_removed_from_a_full_disk(
+def test_only_acknowledged_messages_but_the_newest_leave_a_full_disk(
     folder: Path, monkeypatch: pytest.MonkeyPatch, acknowledged: int | None, left: list[int]
 ) -> None:
     monkeypatch.setattr(spool_module, "AGAIN_S", 0.001)

@@ -30,7 +30,7 @@ SECOND_COST_NS = 400_000_000
 
 @dataclass(eq=False, kw_only=True)
 class Job:
-    """An exchange with a drive that the schedule repeats.
+    """A repeated exchange with a drive.
 
     Jobs of one `kind` have the same line settings and silence. They take the least time if they follow each
     other.
@@ -210,9 +210,10 @@ class Schedule(Generic[J]):
         self._health: dict[int, Health] = self.back_off.health
         self._waiting: list[tuple[int, int, J]] = []  # heap of (due time, number, job)
         self._begun: list[J] = []  # jobs that are due but not carried out yet
-        # earliest time of the next request, by drive; only for drives that need a pause between requests
+        # earliest time of the next request, by drive; only for drives with a least interval between requests
         self._ready: dict[int, int] = {}
-        self._held: list[J] = []  # jobs without a period that wait for the end of their drive's interval
+        # jobs without a period that wait for the end of their drive's least interval
+        self._held: list[J] = []
         self._round: list[J] = []  # jobs without a period, in the order of polling
         self._next = 0  # index in `_round` of the next job
         # bus time that jobs without a period are entitled to; negative if they have used more than that

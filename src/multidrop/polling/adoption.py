@@ -222,6 +222,7 @@ class Adoption:
     def carry_out(self, *, start: bool) -> dict[str, LineError]:
         """Change the lines; with `start`, poll the new lines. Return the errors of ports, by line name."""
         self._let_go()
+        # New ports are opened last, so that a slow port never delays the stop of a drive that is replaced.
         failures = self._change() | self._open(start)
         self._lines.put_in_order([line.name for line in self._plant.lines])
         return failures
@@ -237,8 +238,8 @@ class Adoption:
     def _change(self) -> dict[str, LineError]:
         """Change the lines that keep their ports, one by one; return the errors of ports, by line name.
 
-        If a drive's name moves from one line to another, the first of these two lines is changed first. Lines
-        that wait for each other in a circle are changed together, after their stops have ended.
+        If a drive's name moves from one line to another, the line that it leaves is changed first. Lines that
+        wait for each other in a circle are changed together, after their stops have ended.
         """
         failures: dict[str, LineError] = {}
         names = {polled.drive.name for polled in self._plant.drives}

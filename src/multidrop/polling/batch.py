@@ -112,9 +112,7 @@ class WideRows(ArrowTable):
                 raise TypeError(f"wide takes column names as separate arguments, not {name!r}")
         self._columns = {name: _WideColumn() for name in chosen}
         self._times: dict[tuple[int, int], int] = {}  # row numbers by (time, monotonic_ns)
-        self._starts = array(
-            "q"
-        )  # for each row number: the number of restarts of the computer before the row
+        self._starts = array("q")  # number of restarts of the computer before each row, by row number
         restarts, newest = 0, (0, 0)  # `newest`: time and monotonic time of the newest row since the restart
         found: dict[tuple[str, str], _WideColumn | None] = {}
         owners: dict[str, tuple[str, str]] = {}

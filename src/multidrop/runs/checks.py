@@ -1,4 +1,4 @@
-"""Check the commands of a test against the rules, and its steps against the bus cycles of its lines.
+"""Check a test before it runs: its commands against the rules, and its steps against the bus cycles.
 
 No check needs an open port.
 """
@@ -133,7 +133,7 @@ def _lines(plan: RunPlan) -> list[_LineTime]:
 
 
 def longest_pause(plan: RunPlan) -> float:
-    """Return the longest planned time in s between two values of one register, over all necessary registers.
+    """Return the longest planned time in s between two values of a register that the test needs.
 
     These are the registers in conditions, the fault codes, and at least one register of each drive.
     """
