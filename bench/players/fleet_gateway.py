@@ -19,8 +19,7 @@ from spooled import numbered
 
 from multidrop.core import Names
 from multidrop.fleet.errors import FleetError
-from multidrop.fleet.samples.forwarder import Forwarder
-from multidrop.fleet.samples.samples_stream import samples_path
+from multidrop.fleet.samples.samples_stream import Forwarder, samples_path
 from multidrop.samples.spool import Spool
 
 EXCHANGES = 100  # per batch

@@ -30,9 +30,8 @@ from multidrop.fleet.commands.desk import CommandSubjects
 from multidrop.fleet.commands.fleet_commands import FleetCommands
 from multidrop.fleet.commands.log import CommandLog
 from multidrop.fleet.gateway import CommandedLines, FleetGateway, FleetLines
-from multidrop.fleet.samples import forwarder as forwarder_module
-from multidrop.fleet.samples import parquet_sink
-from multidrop.fleet.samples.forwarder import Forwarder
+from multidrop.fleet.samples import hub, samples_stream
+from multidrop.fleet.samples.samples_stream import Forwarder
 from multidrop.fleet.servers import names
 from multidrop.samples import spool as spool_module
 from multidrop.samples.message import PolledUnits
@@ -45,8 +44,8 @@ STARTERS = {
     *("create_task", "ensure_future", "to_thread", "run_in_executor"),
 }
 WAITED_FOR = {  # modules that start tasks or threads, and wait for them
-    *("connections", "fleet_commands", "followed", "forwarder", "gateway", "hub", "leaders"),
-    *("line_keeper", "member", "observer", "page_part", "shares"),
+    *("connections", "fleet_commands", "followed", "gateway", "hub", "leaders"),
+    *("line_keeper", "member", "observer", "page_part", "samples_stream", "shares"),
     "spool",  # this module's thread is checked by the gateway
 }
 MEMBER = (
@@ -195,7 +194,7 @@ async def test_a_command_client_reports_the_end_of_its_connection(fleet: Cluster
 async def test_forwarder_retries_after_an_unexpected_failure(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(forwarder_module, "AGAIN_S", 0.0)
+    monkeypatch.setattr(samples_stream, "AGAIN_S", 0.0)
     spool = Spool(tmp_path / "spool", "gw-1")
     nowhere: Any = None
     forwarder = Forwarder(spool, nowhere)
@@ -248,8 +247,8 @@ async def test_the_hub_retries_if_the_compaction_process_cannot_start(
         tried.append(words)
         raise BlockingIOError("no process is left")
 
-    monkeypatch.setattr(parquet_sink, "_compact", fail_to_begin)
-    merging = asyncio.create_task(parquet_sink.compact_for_ever(tmp_path, every=0.0))
+    monkeypatch.setattr(hub, "_compact", fail_to_begin)
+    merging = asyncio.create_task(hub.compact_for_ever(tmp_path, every=0.0))
     while len(tried) < 3:
         await asyncio.sleep(0)
     merging.cancel()

@@ -35,7 +35,7 @@ from multidrop.fleet.errors import Conflict, Denials, MayNotSend, NoRight
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import LeaseBucket
 from multidrop.fleet.servers.connections import connect_options, inbox_of, paths_of, public_key
-from multidrop.fleet.servers.rights import OTHERS, rights_of
+from multidrop.fleet.servers.files import OTHERS, rights_of
 
 GATEWAYS = ("gw-a", "gw-b")
 USERS = (*GATEWAYS, *OTHERS)

@@ -27,7 +27,7 @@ from multidrop.control import CommandOutcome
 from multidrop.fleet import followed
 from multidrop.fleet.errors import FleetError
 from multidrop.fleet.followed import FollowedFleet, RowReader
-from multidrop.fleet.lines.ownership import owner_value
+from multidrop.fleet.lines.rules import owner_value
 from multidrop.fleet.overview import MISSED_MS, FleetView, FleetWatch
 from multidrop.fleet.samples.samples_stream import StreamMessage
 from multidrop.fleet.servers import names

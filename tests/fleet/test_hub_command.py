@@ -22,11 +22,15 @@ from terminals import closing_terminal
 
 from multidrop import History
 from multidrop.cli import main
-from multidrop.fleet.samples import parquet_sink
-from multidrop.fleet.samples.forwarder import Forwarder
-from multidrop.fleet.samples.hub import Commit, SampleHub, StoredPosition
-from multidrop.fleet.samples.parquet_sink import ParquetSink, compact_for_ever
-from multidrop.fleet.samples.samples_stream import create_stream, publish, samples_path, stream_info
+from multidrop.fleet.samples import hub
+from multidrop.fleet.samples.hub import Commit, ParquetSink, SampleHub, StoredPosition, compact_for_ever
+from multidrop.fleet.samples.samples_stream import (
+    Forwarder,
+    create_stream,
+    publish,
+    samples_path,
+    stream_info,
+)
 from multidrop.fleet.servers.connections import ServerPath
 from multidrop.history import compact as compact_module
 from multidrop.history.compact import main as compact
@@ -132,7 +136,7 @@ def test_hub_exits_with_an_error_if_compaction_fails(
     async def end(folder: Path) -> None:
         raise ZeroDivisionError("a mistake")
 
-    monkeypatch.setattr(parquet_sink, "compact_for_ever", end)
+    monkeypatch.setattr(hub, "compact_for_ever", end)
     assert main(["hub", running.urls[0], "--parquet", str(tmp_path)]) == 1
     said = capsys.readouterr().err
     assert "Traceback" in said  # the log is also printed on stderr

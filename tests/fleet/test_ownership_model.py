@@ -10,9 +10,17 @@ from typing import NamedTuple
 import pytest
 from tables import table
 
-from multidrop.fleet.lines import lease_rules
-from multidrop.fleet.lines.lease_rules import SeenRevision, Terms
-from multidrop.fleet.lines.ownership import NEEDED, NOBODY, LineRecords, Owner, claim_of, owner_value
+from multidrop.fleet.lines import rules as lease_rules
+from multidrop.fleet.lines.rules import (
+    NEEDED,
+    NOBODY,
+    LineRecords,
+    Owner,
+    SeenRevision,
+    Terms,
+    claim_of,
+    owner_value,
+)
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import NONE_YET, Record
 

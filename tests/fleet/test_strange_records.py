@@ -19,8 +19,8 @@ from multidrop.fleet.errors import FleetError, OutcomeUnknown
 from multidrop.fleet.gateway import FleetGateway, ask_gateway
 from multidrop.fleet.lines import member as member_module
 from multidrop.fleet.lines.lease import boottime_ns
-from multidrop.fleet.lines.lease_rules import SECOND, USUAL
 from multidrop.fleet.lines.member import Member
+from multidrop.fleet.lines.rules import SECOND, USUAL
 from multidrop.fleet.samples import samples_stream
 from multidrop.fleet.servers import names, setup
 from multidrop.fleet.servers.buckets import LARGE, SMALL, Bucket, LeaseBucket, Record, ServerError, parsed

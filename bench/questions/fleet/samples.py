@@ -27,8 +27,7 @@ from postgres_clusters import Postgres, postgres
 
 from bench.support import tables
 from multidrop import PlantLine
-from multidrop.fleet.samples.hub import Commit, SampleSink
-from multidrop.fleet.samples.parquet_sink import ParquetSink
+from multidrop.fleet.samples.hub import Commit, ParquetSink, SampleSink
 from multidrop.fleet.samples.postgres_sink import PostgresSink
 from multidrop.polling import BatchColumns
 from multidrop.samples.message import Packed, PolledUnits, RowBuffer, unpack

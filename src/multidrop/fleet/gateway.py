@@ -22,12 +22,11 @@ from multidrop.fleet.commands.log import CommandLog
 from multidrop.fleet.commands.offers import HeldLines
 from multidrop.fleet.errors import FleetError, NoRight
 from multidrop.fleet.lines.lease import LifeLock
-from multidrop.fleet.lines.lease_rules import SECOND, USUAL
 from multidrop.fleet.lines.line_keeper import LINES_AT_ONCE, SILENT_S, PortLoss
 from multidrop.fleet.lines.member import Member
 from multidrop.fleet.lines.records import MOST_REPORTED
-from multidrop.fleet.samples.forwarder import Forwarder
-from multidrop.fleet.samples.samples_stream import samples_path
+from multidrop.fleet.lines.rules import SECOND, USUAL
+from multidrop.fleet.samples.samples_stream import Forwarder, samples_path
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import Record, misshapen, with_short_texts
 from multidrop.fleet.servers.connections import ServerPath, paths_of

@@ -12,8 +12,8 @@ from typing import Any
 from multidrop.fleet.errors import FleetError
 from multidrop.fleet.gateway import ask_gateway
 from multidrop.fleet.lines.observer import BELIEVING
-from multidrop.fleet.lines.ownership import owner_of
 from multidrop.fleet.lines.records import FleetRecords, move_of
+from multidrop.fleet.lines.rules import owner_of
 from multidrop.fleet.servers.buckets import Record
 from multidrop.fleet.servers.connections import ServerPath
 from multidrop.fleet.servers.setup import check_buckets

@@ -15,8 +15,8 @@ from tables import table
 from multidrop.fleet.errors import FleetError, OutcomeUnknown
 from multidrop.fleet.lines import lease as leases
 from multidrop.fleet.lines.lease import Lease, LifeLock
-from multidrop.fleet.lines.lease_rules import SECOND, USUAL
 from multidrop.fleet.lines.observer import Observer
+from multidrop.fleet.lines.rules import SECOND, USUAL
 
 
 class Trial:

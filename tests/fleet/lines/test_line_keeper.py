@@ -13,10 +13,9 @@ from fleets import GatedBucket, Hall, HandClock, MemoryBucket, RecordingLines, R
 
 from multidrop.fleet.lines import line_keeper
 from multidrop.fleet.lines.lease import Lease
-from multidrop.fleet.lines.lease_rules import SECOND, USUAL
 from multidrop.fleet.lines.line_keeper import LineKeeper, PortLoss
-from multidrop.fleet.lines.ownership import owner_of, owner_value
 from multidrop.fleet.lines.records import ShareRecords
+from multidrop.fleet.lines.rules import SECOND, USUAL, owner_of, owner_value
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import Record
 

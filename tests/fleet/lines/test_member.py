@@ -17,15 +17,14 @@ from fleets import Hall, HandClock, MemoryBucket, RecordingMastership
 from nats_clusters import Cluster, close_all, opened_paths
 
 from multidrop.fleet.errors import Conflict
-from multidrop.fleet.lines import lease as lease_module
 from multidrop.fleet.lines import line_keeper, shares
 from multidrop.fleet.lines import member as member_module
+from multidrop.fleet.lines import rules as lease_rules
 from multidrop.fleet.lines.lease import HeldRecord, Lease, boottime_ns
-from multidrop.fleet.lines.lease_rules import SECOND, USUAL, Terms
 from multidrop.fleet.lines.line_keeper import PortLoss
 from multidrop.fleet.lines.member import IncompatibleGateways, Member, MemberState
 from multidrop.fleet.lines.observer import Observer
-from multidrop.fleet.lines.ownership import RULES
+from multidrop.fleet.lines.rules import RULES, SECOND, USUAL, Terms
 from multidrop.fleet.servers import leaders, names
 from multidrop.fleet.servers.buckets import Bucket, LeaseBucket
 from multidrop.fleet.servers.connections import paths_of
@@ -419,7 +418,7 @@ class Trial:
         """Start a session of a gateway with this version of the ownership rules."""
         lease = Lease(name, self.buckets, RecordingMastership(self.clock), clock=self.clock)
         with self._monkeypatch.context() as patch:
-            patch.setattr(lease_module, "RULES", rules)
+            patch.setattr(lease_rules, "RULES", rules)
             assert asyncio.run(lease.try_to_begin())
         return lease
 

@@ -11,7 +11,7 @@ from fleet_scale import groups, large_fleet, plant_of_fake_lines, until
 from nats_clusters import Cluster as Servers
 from tables import table
 
-from multidrop.fleet.lines.ownership import NEEDED, Claim, Step, claim_of, decide, owner_by, owner_value
+from multidrop.fleet.lines.rules import NEEDED, Claim, Step, claim_of, decide, owner_by, owner_value
 from multidrop.fleet.servers import leaders, names
 from multidrop.fleet.servers.buckets import Record
 from multidrop.fleet.servers.leaders import SILENT_SERVER_S, Cluster, Releases, Replica

@@ -12,9 +12,8 @@ from tables import table
 
 from multidrop.fleet.errors import OutcomeUnknown
 from multidrop.fleet.lines import records as line_records
-from multidrop.fleet.lines.lease_rules import USUAL
-from multidrop.fleet.lines.ownership import NEEDED, owner_of, owner_value
 from multidrop.fleet.lines.records import Move, Moves, ShareFollower, ShareRecords, move_of
+from multidrop.fleet.lines.rules import NEEDED, USUAL, owner_of, owner_value
 from multidrop.fleet.servers import buckets, names
 from multidrop.fleet.servers.buckets import Bucket, Record
 

@@ -11,9 +11,8 @@ from typing import Any
 from fleets import Hall, HandClock, RecordingMastership
 from tables import table
 
-from multidrop.fleet.lines.lease_rules import SECOND
 from multidrop.fleet.lines.member import SETTLE_S, Member
-from multidrop.fleet.lines.ownership import RULES
+from multidrop.fleet.lines.rules import RULES, SECOND
 from multidrop.fleet.lines.shares import (
     FIRST_WAIT_NS,
     LAST_WAIT_NS,

@@ -21,8 +21,15 @@ from multidrop import History
 from multidrop.fleet.errors import FleetError
 from multidrop.fleet.samples import hub as hub_module
 from multidrop.fleet.samples import samples_stream
-from multidrop.fleet.samples.hub import Commit, HubState, NotThisHubs, SampleHub, SampleSink, StoredPosition
-from multidrop.fleet.samples.parquet_sink import ParquetSink
+from multidrop.fleet.samples.hub import (
+    Commit,
+    HubState,
+    NotThisHubs,
+    ParquetSink,
+    SampleHub,
+    SampleSink,
+    StoredPosition,
+)
 from multidrop.fleet.samples.postgres_sink import PostgresSink
 from multidrop.fleet.samples.samples_stream import StreamMessage, publish
 from multidrop.fleet.servers.connections import ServerPath

@@ -22,12 +22,10 @@ from tables import table
 
 from multidrop import History
 from multidrop.fleet.errors import FleetError, NoRight, OutcomeUnknown
-from multidrop.fleet.samples import forwarder as forwarder_module
 from multidrop.fleet.samples import samples_stream
-from multidrop.fleet.samples.forwarder import Forwarder
-from multidrop.fleet.samples.hub import HubState, SampleHub, SourceCheck
-from multidrop.fleet.samples.parquet_sink import ParquetSink
+from multidrop.fleet.samples.hub import HubState, ParquetSink, SampleHub, SourceCheck
 from multidrop.fleet.samples.samples_stream import (
+    Forwarder,
     StreamMessage,
     create_stream,
     digest_of,
@@ -48,7 +46,7 @@ PATIENCE_S = 30.0
 
 @pytest.fixture(autouse=True)
 def soon(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(forwarder_module, "AGAIN_S", 0.02)
+    monkeypatch.setattr(samples_stream, "AGAIN_S", 0.02)
 
 
 @asynccontextmanager

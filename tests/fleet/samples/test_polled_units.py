@@ -22,8 +22,7 @@ import multidrop
 from multidrop import History
 from multidrop.core import Mastership
 from multidrop.fleet.gateway import FleetLines
-from multidrop.fleet.samples.hub import Commit
-from multidrop.fleet.samples.parquet_sink import ParquetSink
+from multidrop.fleet.samples.hub import Commit, ParquetSink
 from multidrop.fleet.samples.samples_stream import StreamMessage, read_after
 from multidrop.fleet.servers.buckets import Record
 from multidrop.fleet.servers.plant_store import line_of

@@ -46,7 +46,7 @@ from multidrop.fleet.samples.samples_stream import (
 )
 from multidrop.fleet.servers import setup
 from multidrop.fleet.servers.connections import inbox_of, new_seed, public_key
-from multidrop.fleet.servers.rights import OTHERS, rights_of
+from multidrop.fleet.servers.files import OTHERS, rights_of
 from multidrop.samples.spool import Spool
 
 

@@ -20,8 +20,8 @@ from multidrop.fleet.commands.log import CommandLog
 from multidrop.fleet.commands.messages import CommandAnswer, Offered
 from multidrop.fleet.commands.offers import HeldLines
 from multidrop.fleet.errors import Conflict, OutcomeUnknown
-from multidrop.fleet.lines.lease_rules import SECOND
 from multidrop.fleet.lines.line_keeper import PortLoss
+from multidrop.fleet.lines.rules import SECOND
 from multidrop.fleet.servers.buckets import Record, WriteAnswers
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
 from multidrop.supervisor import supervisor

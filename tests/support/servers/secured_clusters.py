@@ -22,8 +22,7 @@ from peers import require_program
 from serial_hall import SerialHall
 
 from multidrop.fleet.servers.connections import connect_options
-from multidrop.fleet.servers.files import ROUTE_PORTS, TlsFiles, write_files
-from multidrop.fleet.servers.rights import STORE
+from multidrop.fleet.servers.files import ROUTE_PORTS, STORE, TlsFiles, write_files
 
 GATEWAYS = ("gw-a", "gw-b", "gw-c")
 PATIENCE_S = 120.0

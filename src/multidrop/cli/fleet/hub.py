@@ -83,7 +83,7 @@ def _sink(arguments: argparse.Namespace) -> SampleSink:
         from multidrop.fleet.samples.postgres_sink import PostgresSink
 
         return PostgresSink(arguments.postgres)
-    from multidrop.fleet.samples.parquet_sink import ParquetSink
+    from multidrop.fleet.samples.hub import ParquetSink
 
     return ParquetSink(arguments.parquet)
 
@@ -91,8 +91,7 @@ def _sink(arguments: argparse.Namespace) -> SampleSink:
 async def _read(arguments: argparse.Namespace, sink: SampleSink, options: dict[str, Any]) -> HubState:
     """Store samples until a signal comes, or with --once until all present samples are stored."""
     with end_signals_cancel():
-        from multidrop.fleet.samples.hub import SampleHub
-        from multidrop.fleet.samples.parquet_sink import compact_for_ever
+        from multidrop.fleet.samples.hub import SampleHub, compact_for_ever
         from multidrop.fleet.samples.samples_stream import samples_path
 
         async with samples_path(arguments.servers, options) as path:

@@ -20,7 +20,7 @@ from multidrop.control import CommandOutcome, CommandResult
 from multidrop.control.commands import carry_out_verb, stop_drive, typed_value, write_register
 from multidrop.drive import verb_arguments, verbs_of
 from multidrop.fleet.commands.messages import CommandAnswer, CommandRequest
-from multidrop.fleet.lines.lease_rules import SECOND
+from multidrop.fleet.lines.rules import SECOND
 
 LIMIT_NS = 1 * SECOND  # time limit from the check of a command until its first frame is sent
 REMEMBERED = 10_000  # limit of remembered commands; the oldest are forgotten

@@ -17,9 +17,8 @@ from typing import Any, NamedTuple
 
 from multidrop.core import Mastership
 from multidrop.fleet.errors import Conflict, FleetError, OutcomeUnknown
-from multidrop.fleet.lines import lease_rules
-from multidrop.fleet.lines.lease_rules import RENEW_S, SECOND, SeenRevision, Terms
-from multidrop.fleet.lines.ownership import RULES
+from multidrop.fleet.lines import rules as lease_rules
+from multidrop.fleet.lines.rules import RENEW_S, SECOND, SeenRevision, Terms
 from multidrop.fleet.servers.buckets import NONE_YET, Bucket, Record
 from multidrop.recording import FileLock
 
@@ -192,7 +191,7 @@ class Lease:
     def _value(self, *, ended: bool = False) -> dict[str, Any]:
         return {
             **self._note(),
-            "rules": RULES,
+            "rules": lease_rules.RULES,
             "session": self.session,
             "nonce": self._nonce,
             "ended": ended,

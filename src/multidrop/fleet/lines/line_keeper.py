@@ -18,10 +18,11 @@ from typing import Any, NamedTuple, Protocol
 
 from multidrop.fleet.errors import FleetError
 from multidrop.fleet.lines.lease import Lease
-from multidrop.fleet.lines.lease_rules import SECOND
-from multidrop.fleet.lines.ownership import (
+from multidrop.fleet.lines.records import ShareRecords
+from multidrop.fleet.lines.rules import (
     NEEDED,
     NOBODY,
+    SECOND,
     Claim,
     Owner,
     claim_of,
@@ -29,7 +30,6 @@ from multidrop.fleet.lines.ownership import (
     owner_value,
     turn_of,
 )
-from multidrop.fleet.lines.records import ShareRecords
 from multidrop.fleet.lines.shares import UnopenedLines
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import Record, WriteAnswers

@@ -27,11 +27,10 @@ from typing import Any
 
 from multidrop.core import Mastership
 from multidrop.fleet.lines.lease import Lease, LifeLock
-from multidrop.fleet.lines.lease_rules import SECOND, USUAL, Terms
 from multidrop.fleet.lines.line_keeper import LineKeeper, Lines, TakenLine
 from multidrop.fleet.lines.observer import Observer
-from multidrop.fleet.lines.ownership import RULES, decide, owner_of
 from multidrop.fleet.lines.records import ShareRecords
+from multidrop.fleet.lines.rules import RULES, SECOND, USUAL, Terms, decide, owner_of
 from multidrop.fleet.lines.shares import Sharers, Shares
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import LeaseBucket, Record

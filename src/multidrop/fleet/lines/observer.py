@@ -16,9 +16,9 @@ from contextlib import suppress
 from typing import Any
 
 from multidrop.fleet.errors import Conflict, FleetError
-from multidrop.fleet.lines import lease_rules
+from multidrop.fleet.lines import rules as lease_rules
 from multidrop.fleet.lines.lease import boottime_ns
-from multidrop.fleet.lines.lease_rules import SeenRevision, Terms
+from multidrop.fleet.lines.rules import SeenRevision, Terms
 from multidrop.fleet.servers.buckets import Bucket, Follower, Record
 from multidrop.supervisor import end_tasks
 

@@ -16,9 +16,8 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from multidrop.fleet.errors import FleetError
-from multidrop.fleet.lines.lease_rules import Terms
 from multidrop.fleet.lines.observer import Observer
-from multidrop.fleet.lines.ownership import NOBODY, LineRecords, Owner, owner_by, owner_of
+from multidrop.fleet.lines.rules import NOBODY, LineRecords, Owner, Terms, owner_by, owner_of
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import FOLLOW_S, NONE_YET, Bucket, Follower, LeaseBucket, OnTake, Record
 from multidrop.fleet.servers.connections import ServerPath

@@ -23,7 +23,7 @@ from typing import NamedTuple
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from multidrop.fleet.lines.lease_rules import SECOND
+from multidrop.fleet.lines.rules import SECOND
 
 BOUND = 110  # limit of a gateway's lines, in percent of the mean
 NUMBER_BITS = 16  # number of low bits of a line's hash that are replaced by a gateway's number

@@ -17,7 +17,7 @@ from contextlib import suppress
 from typing import Any, NamedTuple
 
 from multidrop.fleet.errors import FleetError, OutcomeUnknown
-from multidrop.fleet.lines.ownership import NEEDED
+from multidrop.fleet.lines.rules import NEEDED
 from multidrop.fleet.servers import names
 from multidrop.fleet.servers.buckets import ask
 from multidrop.fleet.servers.connections import ServerPath
