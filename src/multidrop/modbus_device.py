@@ -36,9 +36,9 @@ class ModbusDevice(Drive):
     """A Modbus device without a declared family, whose tables are read and written by address.
 
     Addresses are those on the wire, from 0. Numbers have the formats of family files ("U16" to "F64") and the
-    byte orders "ABCD", "CDAB", "BADC" and "DCBA". As for other drives, the library waits for the
-    silence between frames, retries reads, detects late replies, and records writes in the audit log. A write
-    needs `confirm=True`, because it may start a motor.
+    byte orders "ABCD", "CDAB", "BADC" and "DCBA". As for other drives, the library waits for the silence
+    between frames, retries reads, detects late replies, and records writes in the audit log. A write needs
+    `confirm=True`, because it may start a motor.
     """
 
     title = "Modbus device"
@@ -149,8 +149,8 @@ class ModbusDevice(Drive):
     ) -> list[bool]:
         """Write a coil or several from `start`, and return the coils that the device then holds.
 
-        If the device refuses to be read back, the written coils are returned. Raises the errors
-        of `write_holding`.
+        If the device refuses to be read back, the written coils are returned. Raises the errors of
+        `write_holding`.
 
         One coil is written by function 5, several by function 15. With `multiple`, function 15 also writes
         one coil.

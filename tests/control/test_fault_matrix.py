@@ -204,9 +204,7 @@ def test_verb_outcomes_during_faults_equal_the_table(part: int, cell: tuple[str,
         if fault == "exception" and family == NO_EXCEPTIONS:
             return
         with pytest.MonkeyPatch.context() as monkeypatch:
-            monkeypatch.setattr(
-                records, "LEAST_INTERVAL", 0.0
-            )  # seconds between EEPROM writes of one register
+            monkeypatch.setattr(records, "LEAST_INTERVAL", 0.0)  # seconds between two EEPROM writes
             tried = Cell(family, situation)
             tried.strike(fault)
             outcome = tried.outcome(verb)

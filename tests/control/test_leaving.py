@@ -120,15 +120,15 @@ def test_closing_a_bus_waits_for_stops_unless_repeated_signals_end_the_wait(
     pair.bus.stop_on_exit()
     waited: list[object] = []
     monkeypatch.setattr(pair.bus._latches, "await_stops", lambda *drives: waited.append(drives))
-    act = pair.bus._leaving._exit_task
-    assert act is not None
-    until_over = act.finish
+    task = pair.bus._leaving._exit_task
+    assert task is not None
+    until_over = task.finish
 
     def finish() -> None:
         until_over()
-        act.is_cut_short = is_cut_short
+        task.is_cut_short = is_cut_short
 
-    monkeypatch.setattr(act, "finish", finish)
+    monkeypatch.setattr(task, "finish", finish)
     pair.bus.part()
     assert pair.turning == [False, False]
     assert waited == ([] if is_cut_short else [()])

@@ -125,7 +125,7 @@ def test_a_raw_request_bypasses_the_write_rules() -> None:
 
 
 @every_family
-def test_identity_is_checked_only_before_the_first_write(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
+def test_identity_is_checked_once_per_opened_port(monkeypatch: pytest.MonkeyPatch, model: str) -> None:
     monkeypatch.setattr(records, "LEAST_INTERVAL", 0.0)  # seconds between writes of one register to an EEPROM
     line, drive, _ = one(MAKE[model](1))
     drive.set_frequency(20)

@@ -241,7 +241,7 @@ class Stranger:
 @pytest.mark.slow
 @pytest.mark.long
 @pytest.mark.parametrize("model", RTU_FAMILIES)
-def test_the_starts_and_stops_are_correct_while_another_client_sends(model: str) -> None:
+def test_starts_and_stops_are_correct_while_another_client_sends(model: str) -> None:
     with shared_line(model, seed=1) as (drive, pair, (first, second)), ExitStack() as stack:
         set_frequency(drive, 20)
         stranger = stack.enter_context(Stranger(pair.theirs, model, seed=2))

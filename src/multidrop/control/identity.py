@@ -35,7 +35,10 @@ Timed = Callable[[], AbstractContextManager[None]]
 
 
 class Suspicion(NamedTuple):
-    """Why a drive may not be of its declared family. `make` is the make that it seems to be, if known."""
+    """Why a drive may not be of its declared family.
+
+    `make` is the make that the drive answers as, if its registers show one; `why` is then "".
+    """
 
     why: str
     is_certain: bool = False
@@ -169,7 +172,7 @@ class IdentityCheck:
             make = self._shown(drive, _of_same_register(drive), timed)
             if make is None:
                 raise
-            why = f"{refusal}; the drive answers as {_described(make)}"
+            why = f"{refusal}; the drive {_described(make)}"
             raise WriteForbidden(why, rule=refusal.rule) from refusal
         except DriveException as refusal:
             kind = drive.title or type(drive).__name__
@@ -197,7 +200,7 @@ class IdentityCheck:
             before = peer.silences
             make = self._shown(drive, makes, timed)
             if make is not None:
-                why = f"nothing is written to {drive.name}: the drive answers as {_described(make)}"
+                why = f"nothing is written to {drive.name}: the drive {_described(make)}"
                 raise WriteForbidden(why, rule="it shows another make")
             if peer.silences == before:
                 break
@@ -308,7 +311,7 @@ class IdentityCheck:
         """Return a suspicion if `identify` cannot exclude these makes and the drive answers like one."""
         makes = self._while_in_step(drive, rivals)
         make = self._shown(drive, makes) if drive.identity_is_weak else None
-        return None if make is None else Suspicion(f"it answers as {_described(make)}", make=make)
+        return None if make is None else Suspicion("", make=make)
 
     def _shown(self, drive: Drive, makes: Iterable[Make], timed: Timed = nullcontext) -> Make | None:
         """Check the drive's registers for each of these makes; return the first make that fits, or None.
@@ -411,11 +414,11 @@ def _is_harmless_in(family: type[Drive], register: Register[Any], count: float) 
 
 
 def _described(make: Make) -> str:
-    return f"{_with_article(make.title)} does. If it is one, declare model = {make.model}"
+    return f"{_answers_as(make.title)}. If it is one, declare model = {make.model}"
 
 
-def _with_article(title: str) -> str:
-    return f"{'an' if title[0] in 'AEIO' else 'a'} {title}"
+def _answers_as(title: str) -> str:
+    return f"answers as {'an' if title[0] in 'AEIO' else 'a'} {title} does"
 
 
 def _forget_setpoint(drive: Drive) -> None:
@@ -433,10 +436,10 @@ def _withheld(drive: Drive, why: str, other: Drive | Make | None) -> WriteForbid
     way = "Use the hard-wired stop, and find out which drive has this address"
     if other is not None:
         attach = f"{type(other).__name__}({drive.address})" if isinstance(other, Drive) else other.model
+        why = "; ".join(filter(None, (why, f"it {_answers_as(other.title)}")))
         way = (
-            f"It answers as {_with_article(other.title)} does. Use the hard-wired stop, or "
-            f"`multidrop stop PORT {other.model} {drive.address}`; in a program, detach {drive.name}, "
-            f"attach {attach} and stop that"
+            f"Use the hard-wired stop, or `multidrop stop PORT {other.model} {drive.address}`; in a program, "
+            f"detach {drive.name}, attach {attach} and stop that"
         )
     return WriteForbidden(
         f"no stop was sent to {drive.name}: two checks found another drive at its address, which this stop "

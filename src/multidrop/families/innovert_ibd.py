@@ -100,11 +100,11 @@ class IBDFormat(IntEnum):
     RTU_8O1 = 5
 
 
-# registers that a sibling declares: the meaning of 0, the step that a code needs, and its words
+# registers of the state that a sibling declares: when the value is 0, and whether it is a code
 OF_STATE = {
-    "run_state": ("at rest", 1, ", and its step is 1"),
-    "output_frequency": ("at rest", 0, ""),
-    "fault": ("without a fault", 1, ", and its step is 1"),
+    "run_state": ("at rest", True),
+    "output_frequency": ("at rest", False),
+    "fault": ("without a fault", True),
 }
 
 
@@ -243,10 +243,11 @@ class InnovertIBD(Drive):
         """Return a mistake for each register of OF_STATE that could show 0 while its raw count is not 0."""
         found = {name: own[name] for name in OF_STATE if isinstance(own.get(name), Register)}
         return [
-            f"{name}: it is 0 only {meaning}, so it cannot have a part, offset or scale_register{codes}"
+            f"{name}: it is 0 only {meaning}, so it cannot have a part, offset or scale_register"
+            + (", and its step must be 1" if is_code else "")
             for name, one in found.items()
-            for meaning, step, codes in [OF_STATE[name]]
-            if one.part or one.offset or one.scale_register or (step and one.step not in (step, None))
+            for meaning, is_code in [OF_STATE[name]]
+            if one.part or one.offset or one.scale_register or (is_code and one.step not in (1, None))
         ]
 
     def needed_silence(self) -> float:
@@ -374,7 +375,7 @@ class InnovertIBD(Drive):
     @property
     def _has_state(self) -> bool:
         """True if a subclass has added run state, output frequency and fault, as family files may do."""
-        return {"run_state", "output_frequency", "fault"} <= self.registers.keys()
+        return OF_STATE.keys() <= self.registers.keys()
 
     def _code(self) -> Script[int]:
         return int((yield from read(self.register("fault"))))
