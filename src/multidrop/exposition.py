@@ -13,7 +13,7 @@ OPEN_METRICS_TYPE = f"{OPEN_METRICS}; version=1.0.0; charset=utf-8"
 PLAIN_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 # replacements for kinds of metrics that the plain format lacks
 PLAIN_KINDS = {"info": "gauge", "stateset": "gauge"}
-# In the plain format, the names of these kinds of metrics end in a suffix.
+# in the plain format: suffixes of metric names, by kind of metric
 NAMED_WITH_SUFFIX = {"info": "_info", "counter": "_total"}
 MOST_LABELS = 16_384  # limit of label texts in the cache, about 5 MB
 

@@ -232,7 +232,7 @@ class ChannelSet:
         fresh.add(row.slot)
 
     def _status(self, slots: Iterable[int]) -> int:
-        """Return the status of a row that is computed from the newest rows of these series."""
+        """Return the status of a row that is computed from the newest rows of the given series."""
         missing = [slot for slot in slots if self._statuses[slot] not in (Status.OK, UNSEEN)]
         if missing:
             return self._statuses[max(missing, key=self._sent_ns.__getitem__)]

@@ -260,7 +260,7 @@ class Program:
         return [memory for memory in self.memories if memory.is_total]
 
     def interrupt(self, slots: Collection[int]) -> None:
-        """Exclude the time until the next value from integrals etc. of these registers and channels."""
+        """Exclude the time until the next value from integrals etc. of the given registers and channels."""
         for step in self._instructions:
             if isinstance(step, _Memorised) and not step.slots.isdisjoint(slots):
                 step.memory.is_interrupted = True

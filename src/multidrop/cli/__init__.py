@@ -1,6 +1,6 @@
 """The command line: runs one command. A failure becomes a sentence on stderr and an exit status.
 
-Each command's module is imported only when the command runs, so `multidrop --help` imports none of them.
+Each command's module is imported only when the command runs. `multidrop --help` imports no such module.
 """
 
 from __future__ import annotations

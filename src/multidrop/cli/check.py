@@ -187,7 +187,7 @@ def _unknown_of(drive: Drive, register: Register[Any]) -> Iterator[str]:
 
 
 def crowded(plant: Plant) -> Iterator[Remark]:
-    """Yield each line with more drives than the manual of one of them allows, and a sentence about it."""
+    """Yield each line with more drives than the manual of a drive on it allows, and a sentence about it."""
     for line in plant.lines:
         stated = [polled.drive for polled in line.drives if polled.drive.most_devices]
         strictest = min(stated, key=lambda drive: drive.most_devices, default=None)

@@ -79,7 +79,7 @@ def schema_of(kind: str, names: Sequence[str] = (), folder: Path | None = None) 
     """Return the JSON Schema of a "plant" or "family" file in `folder`.
 
     For "plant", `names` are a user's own families, such as "meter.toml" or "fan.py:Fan". For "family", they
-    are the CSV files that the family file may name. Raises ValueError if one of these cannot be used.
+    are the CSV files that the family file may name. Raises ValueError if such a file cannot be used.
     """
     if kind == "family":
         from multidrop.families.files.registers import beside

@@ -155,7 +155,7 @@ def _is_file(words: list[str]) -> bool:
 def _both(one: Target | ParameterSet, other: Target | ParameterSet) -> tuple[ParameterSet, ParameterSet]:
     """Return the two parameter sets to compare.
 
-    If one of them is a file, only the parameters in the file are read from the drive.
+    If one set is a file, only the parameters in the file are read from the drive.
     """
     sides = [
         ParameterSet(each.drive.model, {}, source=each.drive.name) if isinstance(each, Target) else each

@@ -151,7 +151,7 @@ def _start_at(drive: Drive, hz: float, direction: Direction | None) -> object:
 
 
 def _target(arguments: argparse.Namespace) -> tuple[Target, list[str]]:
-    """Return the named drive and the words after it. For a stop, warn of these words and ignore them."""
+    """Return the named drive and the words after it. For a stop, warn of such words and ignore them."""
     command = arguments.command
     if command not in STOPS:
         target, words = target_of(arguments)

@@ -325,7 +325,7 @@ class JoinedStops:
     """Starts the stops that arrive over one interface, so that a flood of stops delays no other stop.
 
     While MOST_STOPS stops of the same drives are in progress, further ones wait for JOIN_S seconds. Then one
-    stop is started for all of them.
+    stop is started for all waiting callers.
     """
 
     def __init__(self) -> None:
@@ -344,7 +344,7 @@ class JoinedStops:
         return self._joined[drives]
 
     def joins(self, drives: object) -> bool:
-        """Return True if a further stop of these drives would be joined with others."""
+        """Return True if a further stop of the drives would be joined with others."""
         return self._running[drives] >= MOST_STOPS
 
     async def _start_joined(self, drives: object, start: Callable[[], asyncio.Future[R]]) -> R:

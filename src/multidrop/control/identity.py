@@ -189,10 +189,10 @@ class IdentityCheck:
         self._know(drive, findings, silences, was_heard=was_heard)
 
     def _exclude(self, drive: Drive, makes: Sequence[Make], timed: Timed, silences: int) -> int:
-        """Raise WriteForbidden if the drive's registers show one of these makes.
+        """Raise WriteForbidden if the drive's registers show an excluded make.
 
         A missing reply has two possible causes. The drive may lack the register that was read, or the drive
-        may be of one of these makes and its reply was lost. So the check is repeated after a missing reply.
+        may be of an excluded make and its reply was lost. So the check is repeated after a missing reply.
         Returns `silences`, plus the number of replies that are missing because the drive lacks the registers.
         """
         peer = self._exchanges.peers.of(drive)
@@ -314,7 +314,7 @@ class IdentityCheck:
         return None if make is None else Suspicion("", make=make)
 
     def _shown(self, drive: Drive, makes: Iterable[Make], timed: Timed = nullcontext) -> Make | None:
-        """Check the drive's registers for each of these makes; return the first make that fits, or None.
+        """Check the drive's registers for each make; return the first make that fits, or None.
 
         A make fits if SURE checks in a row show it. After a missing reply, makes that answer every request
         are skipped.

@@ -91,7 +91,7 @@ def _stop(drives: Sequence[Drive]) -> None:
     """Stop all drives, each on a thread of its own, because a silent drive must not delay the others.
 
     If the system has no thread left, first send one stop to each remaining drive, without repetitions. Then
-    stop one drive after another. If Ctrl-C interrupts this, send each of them one more stop.
+    stop one drive after another. If Ctrl-C interrupts this, send each drive one more stop.
     """
 
     def stop(drive: Drive, seconds: float | None = None) -> None:

@@ -240,7 +240,7 @@ class Columns:
 
     @classmethod
     def lent(cls, made: Any, give_back: Callable[[Any], object]) -> Columns:
-        """Return columns in the memory `made`. When all views of it are freed, call `give_back(made)`."""
+        """Return columns in the memory `made`. When all its views are freed, call `give_back(made)`."""
         columns = cls.__new__(cls)
         columns._own(made, give_back)
         return columns
@@ -259,7 +259,7 @@ class Columns:
 
     @cached_property
     def _memory(self) -> memoryview[Any]:
-        """A buffer over the struct and all columns, whose memory lives as long as any view of it."""
+        """A buffer over the struct and all columns, whose memory lives as long as any view of the buffer."""
         return memoryview(ffi.buffer(self.c, self._at("valid") + (self.c.room + 7) // 8))
 
     def array(self, name: str) -> memoryview[Any]:
@@ -422,14 +422,14 @@ def wide_codes(codes: bytes | memoryview[Any], rows: int, size: int) -> memoryvi
 
 
 def greatest_code(codes: memoryview[Any]) -> int:
-    """Return the greatest of these uint16 codes; 0 if there are none."""
+    """Return the greatest of the uint16 codes; 0 if there are none."""
     return int(lib.md_greatest_code(ffi.from_buffer("uint16_t[]", codes), len(codes)))
 
 
 def find_codes(
     drives: memoryview[Any], registers: memoryview[Any], series: Iterable[tuple[int, int]]
 ) -> list[int]:
-    """Return the sorted indexes of the rows with one of these pairs of codes (drive, register)."""
+    """Return the sorted indexes of the rows whose pair of codes (drive, register) is in `series`."""
     rows = len(drives)
     given = ffi.from_buffer("uint16_t[]", drives), ffi.from_buffer("uint16_t[]", registers), rows
     out, found = ffi.new("uint32_t[]", max(rows, 1)), list[int]()

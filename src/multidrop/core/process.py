@@ -201,7 +201,7 @@ def log_aside(logger: logging.Logger, level: int, text: str, *details: object) -
 
 
 def words_of(failure: BaseException) -> str:
-    """Return an exception's type and message on one line; only its type if `str` of it fails."""
+    """Return an exception's type and message on one line; only its type if `str` fails."""
     try:
         return " ".join(f"{type(failure).__name__}: {failure}".split()).removesuffix(":")
     except BaseException:  # a user's exception class may raise anything

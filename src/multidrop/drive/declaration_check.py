@@ -308,7 +308,7 @@ def _fits_table(register: Register[Any]) -> bool:
     return register.number_format is wanted
 
 
-# Number formats of which a register may use only some of the bits.
+# number formats that allow a register to use only some of the number's bits
 _PARTED = frozenset(
     {
         *(NumberFormat.U16, NumberFormat.U32, NumberFormat.U64),

@@ -91,7 +91,7 @@ class Drive(RegisterAccess):
 
     # limit of registers in one read, by table; default: the Modbus limit
     most_registers: ClassVar[Mapping[Table, int]] = {}
-    # by table: addresses that one read may include, although some of them have no register
+    # by table: addresses that one read may include, although some addresses have no register
     readable_gaps: ClassVar[Mapping[Table, range]] = {}
     # groups of registers that one request must read, in this order
     read_together: ClassVar[tuple[tuple[str, ...], ...]] = ()

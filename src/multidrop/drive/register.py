@@ -547,7 +547,7 @@ def catalogue(language: str) -> Mapping[str, str]:
 
 
 def chosen_language(tags: Iterable[str]) -> str:
-    """Return the first of these languages in which registers have titles; English if there is none.
+    """Return the first language of `tags` in which registers have titles; English if there is none.
 
     A tag may be `ru`, `zh-CN` or `ru_RU.UTF-8`, for example.
     """

@@ -67,7 +67,7 @@ def readable_addresses(family: Any, table: Table) -> frozenset[int]:
 
 
 def may_be_crossed(family: Any, table: Table, addresses: Iterable[int]) -> bool:
-    """Return True if one read may include all these addresses, even if some of them are not needed."""
+    """Return True if one read may include all these addresses, even those that are not needed."""
     declared = family if isinstance(family, type) else type(family)
     readable, gaps = readable_addresses(declared, table), stated_gaps(family, table)
     return all(at in readable or any(at in gap for gap in gaps) for at in addresses)

@@ -202,7 +202,7 @@ TRIES = 150  # limit of attempts to begin a stop while the system lacks memory o
 
 
 class CalledStop(Protocol):
-    """A stop that was called. If `carry_out` failed, another call of it resumes the stop."""
+    """A stop that was called. If `carry_out` failed, another call of `carry_out` resumes the stop."""
 
     def carry_out(self) -> None: ...
     def interrupted(self, interruption: BaseException) -> None: ...

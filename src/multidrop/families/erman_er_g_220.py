@@ -212,7 +212,7 @@ class ErmanERG220(Drive):
     braking_threshold = _control(0x0015, "V", place="E.06", note="Of dynamic braking.")
 
     # The command coils, as the drive reports them: they show the last command (sections 6 and 10). A read
-    # includes only the wanted coils, so that its reply has all of them in one byte.
+    # includes only the wanted coils, so that its reply has all wanted coils in one byte.
     start_held = _held(0x0000, Coil)
     stop_held = _held(0x0001, Coil)
     emergency_stop_held = _held(0x0002, Coil)

@@ -19,7 +19,7 @@ from multidrop.families.innovert_ibd import IBDBaudrate
 
 
 class Evidence(Drive):
-    """The registers by which makes are recognised, at the addresses in the manuals of these makes."""
+    """The registers by which makes are recognised, at the addresses in the makes' manuals."""
 
     goodrive_state = reading(0x2100, place="Goodrive200A manual p. 140")
     goodrive_device = reading(0x2103, place="Goodrive200A manual p. 140 to 142")

@@ -176,7 +176,7 @@ class YD1000(Drive):
       0800H to 0802H are not written either: they set baud rate, format and address. 0800H and 0801H take
       effect after a reset or at the next power-on, 0802H and 0803H at once (section 7).
     - CNOD, FNOD, FR, F103, F104 and F110 to F115 decide what commands the motor, and it is not stated what
-      AU3 sets by itself. All of these are read and never written.
+      AU3 sets by itself. All these parameters are read and never written.
     - 0803H, the watchdog, is written only while the motor is at rest (the document does not require that): a
       time shorter than the pause between two polls trips the drive.
     - The table of faults is missing: codes are shown as they are. The meanings of exceptions are those of a

@@ -298,7 +298,7 @@ def natural(name: str) -> list[str | int]:
 
 
 def line_table(fleet: FleetState, names: Iterable[str], width: float = inf) -> list[str]:
-    """Return the table of these lines. Columns are left out if it would be wider than `width`."""
+    """Return the table of the named lines. Columns are left out if it would be wider than `width`."""
     silent = silent_gateways(fleet)
     rows = [_line_row(name, fleet["lines"][name], silent) for name in names]
     return _fitting([LINES, *rows], "<<<<", LINES_LEFT_OUT, width)

@@ -128,7 +128,7 @@ def _drop_typed_input() -> None:
 def reporting_interruption(drive: Drive, command: str) -> Iterator[list[str]]:
     """If Ctrl-C ends the block, add notes to the KeyboardInterrupt about the requests sent so far.
 
-    Yields the list of these notes. At first it says that no request was sent; the caller replaces its
+    Yields the list of notes. At first the list says that no request was sent; the caller replaces its
     contents. If Ctrl-C came during the handling of a BusError, that error becomes a note too.
     """
     known = [f"{drive.name}: the {command} was not sent"]

@@ -156,7 +156,7 @@ def _counting() -> list[dict[str, Any]]:
 
 
 def _addresses(numbers: Iterable[int]) -> dict[str, Any]:
-    """Return the schema of these addresses, as numbers or as hex text."""
+    """Return a schema that allows these addresses, as numbers or as hex text."""
     numbers = [*numbers]
     digits = "|".join(re.sub("[A-F]", lambda one: f"[{one[0]}{one[0].lower()}]", f"{n:X}") for n in numbers)
     pattern = rf"^\s*(0[xX]0*({digits})|0*({digits})[hH])\s*$"

@@ -458,7 +458,7 @@ PROOF_KEYS = {
 
 @dataclass(frozen=True)
 class Proof:
-    """A register that identifies the family: it has one of these values, or a value in this range."""
+    """A register that identifies the family: its value is in `values`, or between `above` and `below`."""
 
     register: str
     values: tuple[float, ...]  # accepted values; empty: every value in the range is accepted

@@ -85,7 +85,7 @@ def own_errors(
 
 
 def code_errors(register: Register[Any]) -> Iterator[str]:
-    """Yield an error if this register is not a code, such as a fault's, of which only 0 has value 0."""
+    """Yield an error unless this register is a code, such as a fault's: only count 0 has value 0."""
     if register.step not in (1, None) or register.offset or register.scale_register:
         yield f"{register.name}: it is a code, so it cannot have a step, offset or scale_register"
 
@@ -215,7 +215,7 @@ class Profile(Drive):
     - `fault` (an optional reading): the fault code, shown by name if it has names;
     - `reference_in_force` (an optional reading): the setpoint that the drive shows;
     - `station` (an optional reading): the drive's own address;
-    - `signature` (an optional reading of named values): every drive of the family has one of these values.
+    - `signature` (an optional reading of named values): the value of every drive of the family has a name.
 
     The verbs guarantee the same as those of the built-in families. A stop is always sent, repeated until it
     is confirmed, and observed until the drive is at rest. A start or a reset is written once. A start is

@@ -305,7 +305,7 @@ class Moves:
     def newest(self, number: int) -> list[Move]:
         """Return at most this many changes of lines' masters, newest first.
 
-        If a gateway releases a line and another one claims it, each of them reports its own part. The two
+        If a gateway releases a line and another one claims it, each gateway reports its own part. The two
         reports are joined into one change with the former and the new master.
         """
         moves = dict(self._moves)

@@ -2,8 +2,8 @@
 
 Leases: until when may a gateway send, and when may another gateway end its session?
 
-A session has one record in each of three lease buckets. Its holder must renew two of them (`needed`). A
-gateway that takes over must end two of them (`ended`). So both must write in at least one common bucket,
+A session has one record in each of three lease buckets. Its holder must renew two records (`needed`). A
+gateway that takes over must end two records (`ended`). So both must write in at least one common bucket,
 whose server accepts only one of the two writes.
 
 The holder's lease starts right before it sends a renewal. An observer starts to wait when it first sees a
@@ -213,7 +213,7 @@ def decide(
 
     `me` is this gateway's name and session, `wanted` the gateway that each line is assigned to. A line that
     never had a master is claimed only if `is_settled`, which is False in the first seconds of a session.
-    Otherwise the first gateway of a starting fleet would take all of these lines.
+    Otherwise the first gateway of a starting fleet would take all lines that never had a master.
     """
     step = Step({}, set())
     for line in lines:

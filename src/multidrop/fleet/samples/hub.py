@@ -8,7 +8,7 @@ ParquetSink writes a folder that `History(folder)` and DuckDB can read:
 
 | in the folder                           | content                                                   |
 |-----------------------------------------|-----------------------------------------------------------|
-| `rows/FIRST-LAST.BEGIN-END.parquet`     | all rows of these messages of the stream, by drive, time  |
+| `rows/FIRST-LAST.BEGIN-END.parquet`     | all rows of the messages FIRST to LAST, by drive, time    |
 | `tens/FIRST-LAST.BEGIN-END.parquet`     | the same messages, one row per ten seconds of a register  |
 | `.hub.lock`                             | locked by the process that writes here                    |
 

@@ -105,7 +105,7 @@ async def _answer_to(request: Awaitable[T]) -> T:
 async def samples_path(
     urls: Sequence[str], options: Mapping[str, Any] | None = None
 ) -> AsyncIterator[ServerPath]:
-    """Yield a connection to one of these servers, which moves to another server if that one fails.
+    """Yield a connection to one of the servers; if that server fails, the connection moves to another one.
 
     Raises FleetError if no server can be used.
     """

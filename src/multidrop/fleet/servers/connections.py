@@ -321,7 +321,7 @@ def _abort(client: BatchClient) -> None:
 
 
 def paths_of(urls: Sequence[str], options: Mapping[str, Any] | None = None) -> list[ServerPath]:
-    """Return three connections (paths). With three URLs, each of them prefers a different server."""
+    """Return three connections (paths). With three URLs, each connection prefers a different server."""
     paths = [ServerPath([*urls[at % len(urls) :], *urls[: at % len(urls)]], options) for at in range(PATHS)]
     for path in paths:
         path.others, path.budget = [other for other in paths if other is not path], paths[0].budget

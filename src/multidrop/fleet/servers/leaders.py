@@ -260,7 +260,7 @@ class Releases:
         """Return the lines in `lines` that may be handed over now; the other lines must wait.
 
         A bucket is ready if it has a leader and no silent server. A server that is silent for longer than
-        `wait_s` seconds is ignored. At least two buckets must be ready. One of them must be the line's first
+        `wait_s` seconds is ignored. At least two buckets must be ready, including the line's first
         bucket, since its record may be enough to make a gateway the master.
         """
         self._has_lines = bool(lines)
