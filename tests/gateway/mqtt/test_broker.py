@@ -31,19 +31,18 @@ from multidrop.control import CommandOutcome, CommandResult
 from multidrop.gateway.commands import Admit
 from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.http.rights import Caller, Right
-from multidrop.gateway.mqtt import broker as broker_module
+from multidrop.gateway.mqtt import broker_commands
 from multidrop.gateway.mqtt.broker import (
-    MOST_COMMANDS,
     MOST_RECEIVED,
     MOST_UNDER_WAY,
     MOST_WAITING,
     Broker,
-    BrokerCommands,
     Login,
     Outbox,
     Publication,
     parse_broker,
 )
+from multidrop.gateway.mqtt.broker_commands import MOST_COMMANDS, BrokerCommands
 from multidrop.gateway.settings import read_settings
 from multidrop.sim import Simulator, Wire, simulated
 
@@ -396,7 +395,7 @@ async def test_a_stop_is_sent_when_too_many_broker_commands_are_in_progress() ->
 
 async def test_a_command_is_not_sent_after_its_age_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     """The process may be suspended after the command's age was checked."""
-    monkeypatch.setattr(broker_module, "boottime_ns", lambda: 100 * 10**9)
+    monkeypatch.setattr(broker_commands, "boottime_ns", lambda: 100 * 10**9)
     commands: Any = HeldCommands()
     orders = BrokerCommands(commands, CALLER, lambda: NOW_MS, lambda *given: None)
     orders.write("pump-1", "setpoint", 1.0, NOW_MS - 3_000)

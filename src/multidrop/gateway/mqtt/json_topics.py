@@ -16,7 +16,8 @@ from multidrop import Plant
 from multidrop.control import CommandResult
 from multidrop.gateway.commands import STOPPING, drives_of
 from multidrop.gateway.live.hub import SILENT, published_values
-from multidrop.gateway.mqtt.broker import BrokerCommands, Publication
+from multidrop.gateway.mqtt.broker import Publication
+from multidrop.gateway.mqtt.broker_commands import BrokerCommands
 from multidrop.gateway.mqtt.home_assistant import DISCOVERY, discovery, discovery_topic, object_id
 from multidrop.gateway.mqtt.settings import MqttSettings
 from multidrop.gateway.parts import PartContext
