@@ -25,12 +25,11 @@ from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout
 from multidrop.gateway.mqtt.broker import Outbox, Publication
 from multidrop.gateway.mqtt.part import build
 from multidrop.gateway.mqtt.settings import MqttSettings
-from multidrop.gateway.mqtt.sparkplug import (
-    STOP,
+from multidrop.gateway.mqtt.sparkplug import STOP, SparkplugNode
+from multidrop.gateway.mqtt.sparkplug_payload import (
     DataType,
     Metric,
     ReceivedMetric,
-    SparkplugNode,
     payload,
     read_command,
 )
