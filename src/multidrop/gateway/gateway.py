@@ -26,7 +26,8 @@ from multidrop.gateway.http.connections import BACKLOG, Connections, WatchedApp,
 from multidrop.gateway.http.guard import MOST_HEAD
 from multidrop.gateway.http.rights import OwnNames, Tokens
 from multidrop.gateway.http.routes import make_app
-from multidrop.gateway.live.alarms import Alarm, AlarmChange, AlarmFile, Alarms, Limits, current_values
+from multidrop.gateway.live.alarm_file import AlarmFile
+from multidrop.gateway.live.alarms import Alarm, AlarmChange, Alarms, Limits, current_values
 from multidrop.gateway.live.drive_reads import Identities, ParameterReads, SideReads
 from multidrop.gateway.live.frames import Frames, SeenFrames, frame_of, lost_of
 from multidrop.gateway.live.hub import SILENT, Hub

@@ -27,7 +27,8 @@ from multidrop.families.erman_er_g_220 import ErmanFault
 from multidrop.gateway.commands import in_words
 from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.http.rights import Right
-from multidrop.gateway.live.alarms import Alarm, AlarmFile, Alarms, Limit, Limits, alarm_in
+from multidrop.gateway.live.alarm_file import AlarmFile, alarm_in
+from multidrop.gateway.live.alarms import Alarm, Alarms, Limit, Limits
 from multidrop.gateway.live.hub import RAN_NS, Hub, Shown
 from multidrop.gateway.settings import read_settings
 from multidrop.polling.batch import Batch
@@ -300,7 +301,7 @@ def test_invalid_lines_of_the_alarm_file_are_ignored(change: Mapping[str, object
 
 
 def test_a_long_alarm_file_is_rewritten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("multidrop.gateway.live.alarms.MOST_BYTES", 2000)
+    monkeypatch.setattr("multidrop.gateway.live.alarm_file.MOST_BYTES", 2000)
     path = tmp_path / "alarms.jsonl"
     kept = started(path)
     for _ in range(100):
