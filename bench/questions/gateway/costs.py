@@ -32,7 +32,8 @@ from multidrop.gateway.http.connections import Connections, WatchedApp
 from multidrop.gateway.http.routes import make_app
 from multidrop.gateway.live.frames import WHOLE
 from multidrop.gateway.metrics import families_of
-from multidrop.gateway.modbus_server.server import ModbusClient, ModbusPort, ModbusServer
+from multidrop.gateway.modbus_server.clients import ModbusClient, ModbusPort
+from multidrop.gateway.modbus_server.server import ModbusServer
 from multidrop.gateway.modbus_server.settings import ModbusSettings
 from multidrop.gateway.settings import ServeSettings
 from multidrop.polling.batch import Batch

@@ -19,10 +19,10 @@ from tables import usually
 from multidrop import Drive, reading
 from multidrop.control import CommandResult
 from multidrop.families import InvtCHE
-from multidrop.gateway.modbus_server import server as modbus_server
+from multidrop.gateway.modbus_server import clients as modbus_clients
+from multidrop.gateway.modbus_server.clients import ModbusClient, ModbusPort
 from multidrop.gateway.modbus_server.passed_requests import BURST_S, EXPIRY_S, MOST_WAITING, SHARE, LineShare
 from multidrop.gateway.modbus_server.protocol import MbapRequest, PassingBusy, take_request
-from multidrop.gateway.modbus_server.server import ModbusClient, ModbusPort
 from multidrop.gateway.modbus_server.settings import ModbusSettings
 
 UNREAD = 150_000  # so many requests that their answers do not fit into the socket buffers of both sides
@@ -113,7 +113,7 @@ async def test_a_flooding_client_does_not_delay_other_clients() -> None:
     flood, flooded = connected(port)
     other, answered = connected(port)
     flood.data_received(b"".join(request(number, 1, 3, 0, 1) for number in range(1000)))
-    assert len(transactions(flooded.written)) == modbus_server.SLICE
+    assert len(transactions(flooded.written)) == modbus_clients.SLICE
     other.data_received(request(1, 1, 3, 0, 1))
     assert transactions(answered.written) == [1]
     await asyncio.sleep(1)
@@ -128,7 +128,7 @@ def slowly(found: MbapRequest, _: ModbusClient) -> bytes:
 
 async def test_all_busy_modbus_clients_share_one_time_slice_per_loop_cycle() -> None:
     """A stop may have to wait for one cycle, in which each client has a turn."""
-    share = modbus_server.RoundShare()
+    share = modbus_clients.RoundShare()
     clock = cast(ControlledLoop, asyncio.get_running_loop()).passing
     ports = [ModbusPort(slowly, lambda _: True, lambda: clock.now, share) for _ in range(2)]
     block = b"".join(request(number, 1, 3, 0, 1) for number in range(100))
@@ -138,12 +138,12 @@ async def test_all_busy_modbus_clients_share_one_time_slice_per_loop_cycle() -> 
     begun = clock.now
     for client, _ in clients:  # one round
         client._drain()
-    assert clock.now - begun < 60 * 2 * modbus_server.SLICE_S / 3
+    assert clock.now - begun < 60 * 2 * modbus_clients.SLICE_S / 3
     for client, transport in clients:
         while client._waiting:
             client._drain()
         assert transactions(transport.written) == list(range(100))
-    assert share.slice_s == modbus_server.SLICE_S
+    assert share.slice_s == modbus_clients.SLICE_S
 
 
 async def test_invalid_bytes_close_a_modbus_connection_after_earlier_answers() -> None:
@@ -159,7 +159,7 @@ async def test_a_modbus_client_is_disconnected_if_it_reads_no_answers() -> None:
     port = port_of()
     client, transport = connected(port)
     client.pause_writing()
-    await asyncio.sleep(modbus_server.STALLED_S - 0.1)
+    await asyncio.sleep(modbus_clients.STALLED_S - 0.1)
     port.sweep()
     assert not transport.ended
     await asyncio.sleep(0.2)
@@ -169,7 +169,7 @@ async def test_a_modbus_client_is_disconnected_if_it_reads_no_answers() -> None:
     client, transport = connected(port)
     client.pause_writing()
     client.resume_writing()
-    await asyncio.sleep(modbus_server.STALLED_S + 1)
+    await asyncio.sleep(modbus_clients.STALLED_S + 1)
     port.sweep()
     assert not transport.ended
 
@@ -198,7 +198,7 @@ async def test_modbus_writes_start_before_waiting_reads_of_the_same_client(is_st
         client.pause_writing()
     client.data_received(reads(0, 500) + writes(500, 502))
     assert begun[:2] == [500, 501]
-    assert len(begun) == (2 if is_stalled else 2 + modbus_server.SLICE)
+    assert len(begun) == (2 if is_stalled else 2 + modbus_clients.SLICE)
     client.resume_writing()
     await asyncio.sleep(1)
     assert begun == transactions(transport.written) == [500, 501, *range(500)]
@@ -220,8 +220,8 @@ async def test_a_long_queue_of_requests_is_answered_in_several_steps(
 def test_excess_read_requests_are_dropped_if_a_client_reads_no_answers(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(modbus_server, "MOST_UNTAKEN", 4096)
-    monkeypatch.setattr(modbus_server, "MOST_BEHIND", 1000 * READ_SIZE)
+    monkeypatch.setattr(modbus_clients, "MOST_UNTAKEN", 4096)
+    monkeypatch.setattr(modbus_clients, "MOST_BEHIND", 1000 * READ_SIZE)
 
     async def main() -> None:
         begun = 0
@@ -238,7 +238,7 @@ def test_excess_read_requests_are_dropped_if_a_client_reads_no_answers(
         await asyncio.sleep(1)
         assert (begun, transport.is_reading) == (3000, True)
         kept = len(transport.written)
-        assert kept < modbus_server.MOST_UNTAKEN + 500 * len(request(1, 1, 6, 0, 1))
+        assert kept < modbus_clients.MOST_UNTAKEN + 500 * len(request(1, 1, 6, 0, 1))
         transport.taken = kept
         client.resume_writing()
         await asyncio.sleep(1)
@@ -252,7 +252,7 @@ def test_excess_read_requests_are_dropped_if_a_client_reads_no_answers(
 
 
 async def test_requests_beyond_the_queue_limit_are_answered_busy(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(modbus_server, "MOST_BEHIND", 1000 * READ_SIZE)
+    monkeypatch.setattr(modbus_clients, "MOST_BEHIND", 1000 * READ_SIZE)
     client, transport = connected(port_of())
     client.data_received(reads(0, 1002))
     await asyncio.sleep(1)
@@ -266,7 +266,7 @@ async def test_an_idle_client_is_disconnected_unless_it_waits_for_an_answer() ->
     port = port_of(lambda found, _: never if found.transaction == 9 else found.reply(b""))
     connections = [connected(port) for _ in range(3)]
     connections[1][0].data_received(request(9, 1, 3, 0, 1))
-    await asyncio.sleep(modbus_server.IDLE_S - 1)
+    await asyncio.sleep(modbus_clients.IDLE_S - 1)
     connections[2][0].data_received(request(1, 1, 3, 0, 1))
     await asyncio.sleep(2)
     port.sweep()
@@ -277,16 +277,16 @@ async def test_an_idle_client_is_disconnected_unless_it_waits_for_an_answer() ->
 async def test_a_new_client_replaces_the_longest_idle_client_at_the_limit() -> None:
     port = port_of()
     found = []
-    for _ in range(modbus_server.MOST_CLIENTS):
+    for _ in range(modbus_clients.MOST_CLIENTS):
         found.append(connected(port)[1])
         await asyncio.sleep(0.1)
     refused = connected(port)[1]
     # refused instead of replacing another, because no other client was idle for 10 s
     assert refused.ended == "aborted"
-    await asyncio.sleep(modbus_server.FORGETTABLE_S - 6.35)
+    await asyncio.sleep(modbus_clients.FORGETTABLE_S - 6.35)
     assert not connected(port)[1].ended
     assert [transport.ended for transport in found[:2]] == ["aborted", ""]
-    assert len(port.clients) == modbus_server.MOST_CLIENTS
+    assert len(port.clients) == modbus_clients.MOST_CLIENTS
     assert port.refused == 1
 
 

@@ -22,8 +22,8 @@ from multidrop.control import read_audit
 from multidrop.drive import COIL, HOLDING, Carrier
 from multidrop.families import MODELS, InnovertIBD
 from multidrop.families.registry import find_model
+from multidrop.gateway.modbus_server import clients as modbus_clients
 from multidrop.gateway.modbus_server import passed_requests as passing
-from multidrop.gateway.modbus_server import server as modbus_server
 from multidrop.gateway.modbus_server import words
 from multidrop.gateway.modbus_server.protocol import ModbusCode
 from multidrop.gateway.modbus_server.settings import MAIN, ModbusSettings, StopWrite, Unit, Units
@@ -228,9 +228,9 @@ def test_limits_of_modbus_clients_agree_with_the_documentation() -> None:
     text = REFERENCE.partition("## Clients")[2]
     numbers = [int(number) for number in re.findall(r"\d+", text)]
     assert numbers == [
-        *(modbus_server.IDLE_S, modbus_server.STALLED_S),
-        *(modbus_server.MOST_CLIENTS, modbus_server.FORGETTABLE_S, modbus_server.MOST_UNDER_WAY),
-        *(passing.MOST_WAITING, modbus_server.MOST_BEHIND // 1024, 6, modbus_server.MOST_UNTAKEN // 1024),
+        *(modbus_clients.IDLE_S, modbus_clients.STALLED_S),
+        *(modbus_clients.MOST_CLIENTS, modbus_clients.FORGETTABLE_S, modbus_clients.MOST_UNDER_WAY),
+        *(passing.MOST_WAITING, modbus_clients.MOST_BEHIND // 1024, 6, modbus_clients.MOST_UNTAKEN // 1024),
     ]
 
 
