@@ -2,5 +2,5 @@
 
 # names of the nodes that each drive has in addition to its registers
 STATE, FAULT, STOP = MEMBERS = ("State", "Fault", "Stop")
-# ends of node ids after the name of such a node or of a register: none, or a property of this node
-PROPERTIES = ("", "EngineeringUnits", "OutputArguments")
+# names of OPC UA properties that the nodes of registers and of STOP have
+PROPERTIES = UNIT, RESULTS = ("EngineeringUnits", "OutputArguments")

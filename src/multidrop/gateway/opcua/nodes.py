@@ -17,7 +17,7 @@ from asyncua.server.internal_server import InternalServer
 
 from multidrop import Plant, PolledDrive, Register
 from multidrop.gateway.live import hub
-from multidrop.gateway.opcua import FAULT, STATE, STOP
+from multidrop.gateway.opcua import FAULT, RESULTS, STATE, STOP, UNIT
 
 INDEX = 2  # index of the namespace of all nodes of this module
 PLANT, PLANT_STOP = ua.NodeId(1, INDEX), ua.NodeId(2, INDEX)
@@ -231,7 +231,7 @@ class PlantNodes:
         variables = {member: _node_id(name, member) for member in (*registers, STATE, FAULT)}
         items = [
             _object(PLANT, _node_id(name), name, drive.title),
-            *_method(_node_id(name), stop, _node_id(name, STOP, "OutputArguments"), "Stop this drive."),
+            *_method(_node_id(name), stop, _node_id(name, STOP, RESULTS), "Stop this drive."),
             _variable(_node_id(name), variables[STATE], STATE, "runs, stands, fault, silent or unknown", str),
             _variable(_node_id(name), variables[FAULT], FAULT, "what the drive shows as its fault", str),
         ]
@@ -241,7 +241,7 @@ class PlantNodes:
             text = register.note or member
             items.append(_variable(_node_id(name), variables[member], member, text, kind, type_of))
             if unit and kind is float:
-                items.append(_unit(variables[member], _node_id(name, member, "EngineeringUnits"), unit))
+                items.append(_unit(variables[member], _node_id(name, member, UNIT), unit))
         nodes = await self._add(*items)
         found = {}
         for member, node in variables.items():
@@ -375,7 +375,7 @@ def unit_of(unit: str) -> ua.EUInformation:
 
 def _unit(parent: ua.NodeId, node: ua.NodeId, unit: str) -> ua.AddNodesItem:
     value = ua.Variant(unit_of(unit), ua.VariantType.ExtensionObject)
-    return _property(parent, node, "EngineeringUnits", value, ua.ObjectIds.EUInformation)
+    return _property(parent, node, UNIT, value, ua.ObjectIds.EUInformation)
 
 
 def _method(
@@ -392,4 +392,4 @@ def _method(
         "Text", ua.NodeId(ua.ObjectIds.String), ua.ValueRank.Scalar, [], ua.LocalizedText("the outcome")
     )
     arguments = ua.Variant([text], ua.VariantType.ExtensionObject)
-    yield _property(node, results, "OutputArguments", arguments, ua.ObjectIds.Argument)
+    yield _property(node, results, RESULTS, arguments, ua.ObjectIds.Argument)

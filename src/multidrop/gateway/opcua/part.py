@@ -41,7 +41,7 @@ EVERY_S = 0.1  # interval, in s, of passing new values to the server
 SWITCH_S = 0.0005
 # the interpreter's default of this time, 5 ms, which applies if no server runs
 USUAL_SWITCH_S = sys.getswitchinterval()
-# The server gets the drives' states only in every tenth interval, because each takes 50 us to compute.
+# the server gets the drives' states once in this many intervals, because each takes 50 us to compute
 STATE_TURNS = 10
 # in s: how long the answer to a stop waits for the motor; the client's other requests wait as well
 STOP_WAIT_S = 0.4
@@ -100,7 +100,7 @@ class OpcUaSettings:
             for at in range(1, len(parts)):
                 owner, member, rest = ".".join(parts[:at]), parts[at], ".".join(parts[at + 1 :])
                 members = {*drives[owner].registers, *channels[owner], *MEMBERS} if owner in drives else ()
-                if member in members and rest in PROPERTIES:
+                if member in members and rest in ("", *PROPERTIES):
                     yield f'drive "{name}" has the node id of a value of "{owner}": choose another name'
             for channel in channels[name] & {*MEMBERS}:
                 yield f'channel "{channel}" of "{name}" has the node id of another value: choose another name'
