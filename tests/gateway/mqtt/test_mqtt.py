@@ -456,7 +456,7 @@ def test_an_infinite_value_is_published_as_null(listener: Listener, start: Start
     assert b'"output_frequency": null' in said.payload
 
 
-def test_no_command_topic_is_subscribed_if_commands_are_disabled(tmp_path: Path) -> None:
+def test_no_topic_of_drive_commands_is_subscribed_if_commands_are_disabled(tmp_path: Path) -> None:
     require_module("paho.mqtt.client")
     part: Any = build(MqttSettings(sparkplug="works", node="line"), inside(tmp_path))
     assert [messages.topics() for messages in part._formats] == [

@@ -270,7 +270,7 @@ class ClientWrites:
     def _stop_and_answer(
         self, unit: Unit, request: MbapRequest, client: WritingClient, wait_s: float
     ) -> Awaitable[bytes]:
-        """Start a stop. If it is joined with others, answer "acknowledge" now: they may be thousands."""
+        """Start a stop. If it is joined with others, answer "acknowledge" now, so that no answers pile up."""
         is_joined = self._stops.joins(unit.drive.name)
         stopping = self._begin_stop(unit, client)
         if is_joined:

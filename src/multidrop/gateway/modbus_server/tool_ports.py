@@ -72,7 +72,7 @@ SWEEP_S = 1.0  # interval, in s, of checking for idle connections
 # Share of `timeout` after which a request is answered at the latest: a stop although the motor still runs,
 # and a read although the line was not free.
 WAIT_SHARE = 0.75
-# Errors of drives that cannot be reached. The PC tool then gets no reply, as if it were on the line itself.
+# Exception codes for a drive that cannot be reached. The PC tool gets no reply then, as on a real line.
 _UNREACHABLE = (ModbusCode.NO_PATH, ModbusCode.NO_RESPONSE)
 _log = logging.getLogger("multidrop.gateway")
 # A function that starts a request. It returns None if the request gets no answer. Else it returns an
