@@ -148,7 +148,7 @@ def test_forged_and_damaged_messages_are_ignored() -> None:
         (-40.0, "the clock of gw-1 is 40 s ahead of this computer's"),
     ],
 )
-def test_wrong_clock_of_a_gateway_is_reported(
+def test_wrong_clock_is_reported_and_no_sample_is_in_the_future(
     monkeypatch: pytest.MonkeyPatch, utc_s: float, sentence: str
 ) -> None:
     clocks = Clocks(utc_s)

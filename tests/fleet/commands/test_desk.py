@@ -298,7 +298,7 @@ def test_gateway_does_not_answer_a_stop_after_losing_the_line(
     assert desk.written == {"control"}
 
 
-async def test_copies_of_a_stop_message_cause_only_one_stop(desk: Desks) -> None:
+async def test_copies_of_a_stop_cause_one_stop_and_cancel_waiting_commands(desk: Desks) -> None:
     token = desk.offered()
     copies = await asyncio.gather(*(desk.stop(id="one") for _ in range(3)))
     assert len({copy.text for copy in copies if copy}) == 1

@@ -126,7 +126,7 @@ async def test_lease_counts_from_the_second_newest_of_three_renewals() -> None:
     assert lease.until == began + SECOND + USUAL.lease
 
 
-async def test_lease_remains_valid_while_one_of_three_servers_is_down() -> None:
+async def test_lease_survives_one_lost_server_but_not_two() -> None:
     trial, lease = await begun()
     trial.buckets[1].is_down = True
     for _ in range(20):

@@ -330,7 +330,7 @@ async def test_claim_keeps_the_usual_server_order_if_all_are_slow() -> None:
     assert owners(trial) == [ME, ME, NOBODY]
 
 
-async def test_claim_of_a_line_does_not_wait_forever_for_a_failed_server(
+async def test_claim_does_not_wait_for_a_failed_server(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The first record of a new line must be in this bucket. Its server does not answer."""
@@ -403,7 +403,7 @@ async def test_released_line_stays_released_after_a_late_claim_answer() -> None:
     assert trial.lines.taken == set()
 
 
-async def test_line_is_claimed_again_after_an_unanswered_release() -> None:
+async def test_unanswered_release_is_undone_only_if_claims_are_allowed() -> None:
     trial = await claimed()
     trial.are_down()
     trial.keeper.releasing = {"hall"}

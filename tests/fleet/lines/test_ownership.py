@@ -108,7 +108,7 @@ def test_claims_and_releases_follow_the_ownership_records(case: str) -> None:
     assert found == wanted
 
 
-def test_a_line_is_not_claimed_before_its_first_bucket_was_read() -> None:
+def test_line_is_not_claimed_before_its_first_record_was_read() -> None:
     records = records_of(DEAD, DEAD, DEAD)
     records["first"] = None
     assert claim_of(ME, records, is_over) is None
@@ -145,7 +145,7 @@ def owner_by_records(*owners: tuple[str, int] | None, alone: bool = False) -> tu
     return record and (record.value["gateway"], record.value["session"])
 
 
-def test_owner_of_a_line_needs_two_equal_votes() -> None:
+def test_owner_of_a_line_needs_two_votes() -> None:
     assert owner_by_records(LIVING, DEAD, LIVING) == LIVING
     assert owner_by_records(LIVING, NEVER, NEVER, alone=True) == LIVING
     assert owner_by_records(GIVEN, ME, GIVEN) == GIVEN
@@ -277,7 +277,7 @@ def test_lines_are_handed_over_after_a_server_was_silent_for_60_s(monkeypatch: p
     assert trial.releases.due(FIRST_LINES) == set()
 
 
-def test_gateway_gives_up_all_lines_even_if_servers_are_silent(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_draining_gateway_does_not_wait_for_silent_servers(monkeypatch: pytest.MonkeyPatch) -> None:
     trial = Releasing(monkeypatch)
     trial.maimed = set(names.OWNERS)
     trial.led.remove("own_2")

@@ -192,7 +192,7 @@ def test_session_without_lines_is_forgotten() -> None:
     assert len(records._owned) == 1
 
 
-def test_known_plant_lines_are_kept_if_a_later_read_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_plant_lines_read_before_a_failure_are_used(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two reads return all lines. The last read, which would return no further lines, fails."""
     monkeypatch.setattr(buckets, "BATCH", 2)
     path: Any = None

@@ -181,7 +181,7 @@ class Lossy:
 
 
 @pytest.mark.parametrize("fates", ["aaaaaaa", "bbabab", "ababaaabb", "llaboabl", "alolalolb"])
-async def test_forwarder_sends_unanswered_messages_again(
+async def test_forwarder_stores_each_message_once_despite_lost_answers(
     running: Cluster, tmp_path: Path, fates: str
 ) -> None:
     spool = filled(tmp_path / "spool", 6)

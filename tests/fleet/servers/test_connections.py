@@ -324,7 +324,7 @@ async def test_elected_leader_is_changed_again_while_a_server_is_silent(servers:
     assert servers.leaders[names.LEASES[2]] == "n2"
 
 
-async def test_leaders_do_not_change_after_a_long_silence_of_a_server(servers: Servers) -> None:
+async def test_server_that_stays_silent_is_ignored_until_it_returns(servers: Servers) -> None:
     servers.silent = {"n3"}
     servers.leaders[names.LEASES[2]] = "n1"
     await servers.pass_s(round(SILENT_SERVER_S) + 5)

@@ -1,4 +1,4 @@
-"""The stream of all gateways' samples, through JetStream's own API (direct gets: ADR-31).
+"""The stream of all gateways' samples, and its Forwarder. Uses JetStream's own API (direct gets: ADR-31).
 
 A message has the subject `samples.<gateway>.<log id>`. The message's headers contain its number in that
 log (`Multidrop-Sequence`) and a digest of its bytes.

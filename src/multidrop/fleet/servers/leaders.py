@@ -6,6 +6,9 @@ leader for 4 to 9 s. If that happens to two lease buckets, no line is polled. A 
 also starts a newer term, but takes only an instant. So while a server is silent, the lease buckets are handed
 over more often than that server starts elections. The terms of the silent server then stay older. Which
 server leads a bucket has no effect on which gateway may poll: only the records' revisions decide that.
+
+A line can change its master only while its buckets have leaders. So a gateway asks Releases before it hands
+over a line.
 """
 
 from __future__ import annotations
