@@ -13,8 +13,7 @@ from string import ascii_lowercase, digits
 from typing import Any, TypeVar
 
 from multidrop.printable import did_you_mean, is_number, masked, nearest_names, printable
-from multidrop.toml_document import DocumentError
-from multidrop.toml_lines import Lines, Steps, line_numbers
+from multidrop.toml_document import DocumentError, Lines, Steps, line_numbers
 
 T = TypeVar("T")
 

@@ -231,7 +231,7 @@ def test_a_ledger_passed_as_argument_counts_simulated_drives_too(tmp_path: Path)
 @with_names
 def test_a_port_counts_as_simulated_until_its_simulator_is_killed(tmp_path: Path) -> None:
     program = (
-        "import time\nfrom multidrop.sim.port import PtyPort\n"
+        "import time\nfrom multidrop.sim.wire import PtyPort\n"
         "from multidrop.drive.line_settings import Settings\n"
         "port = PtyPort(Settings(9600, '8N1'), None)\nprint(port.path, flush=True)\ntime.sleep(3600)"
     )

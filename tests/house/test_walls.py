@@ -21,8 +21,7 @@ OUTSIDE = {
 }
 # packages by layer, the lowest layer first: a package may import only from lower layers
 LAYERS = [
-    {"errors", "exposition", "iso_time", "printable", "supervisor", "whole_file"},
-    {"toml_document", "toml_lines"},
+    {"errors", "exposition", "iso_time", "printable", "supervisor", "toml_document", "whole_file"},
     {"toml_check"},
     {"core"},
     {"drive"},

@@ -11,8 +11,7 @@ import pytest
 from tables import table
 
 from multidrop.toml_check import Key, TomlPlace
-from multidrop.toml_document import DocumentError, parse_document
-from multidrop.toml_lines import line_numbers
+from multidrop.toml_document import DocumentError, line_numbers, parse_document
 
 
 def mistake(data: str | bytes) -> tuple[int, str]:

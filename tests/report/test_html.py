@@ -34,8 +34,7 @@ def _imported() -> None:
 
     from multidrop.report import Recording, load, plot, plot_page, png, report_page
     from multidrop.report.health import delays, line_uses
-    from multidrop.report.html import _about, _drives
-    from multidrop.report.steps import values_of
+    from multidrop.report.html import _about, _drives, values_of
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from multidrop.plant.loader import load_plant
 from multidrop.plant.model import PlantLine
 from multidrop.sim import FaultyWire, Simulator, load_faults, serve, simulated
 from multidrop.sim.faults import HELP, Faults
-from multidrop.sim.port import is_dead_link
+from multidrop.sim.wire import is_dead_link
 
 ANY_TCP = "tcp://127.0.0.1:0"  # any free TCP port of this computer; replaces a port on another computer
 LOOPBACK = ("127.0.0.1", "localhost")

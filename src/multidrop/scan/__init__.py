@@ -7,7 +7,7 @@ from multidrop.scan.findings import Noise as Noise
 from multidrop.scan.findings import Progress as Progress
 from multidrop.scan.findings import Untried as Untried
 from multidrop.scan.findings import line_setting as line_setting
-from multidrop.scan.plant_writer import plant_text as plant_text
+from multidrop.scan.findings import plant_text as plant_text
 from multidrop.scan.scanner import scan as scan
 from multidrop.scan.sweep import ADDRESSES as ADDRESSES
 from multidrop.scan.sweep import ScanRequest as ScanRequest

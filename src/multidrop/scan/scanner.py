@@ -32,8 +32,7 @@ from multidrop.drive.text import Text
 from multidrop.drive.verbs import Read, Script, Step, carry_out
 from multidrop.errors import BusError, LineError, NoValue, WriteForbidden
 from multidrop.planning.blocks import blocks, text_blocks
-from multidrop.scan.findings import GUESS, Crowd, Finding, Found, Noise, Progress, Untried
-from multidrop.scan.plant_writer import candidate
+from multidrop.scan.findings import GUESS, Crowd, Finding, Found, Noise, Progress, Untried, candidate
 from multidrop.scan.sweep import Sweep
 from multidrop.transport.drive_records import LEAST_TIMEOUT
 from multidrop.transport.exchange import good_reply

@@ -18,8 +18,7 @@ from time import monotonic
 from typing import Self
 
 from multidrop.core.process import register_at_fork, undisturbed
-from multidrop.sim.port import SimulatedEnd
-from multidrop.sim.wire import Wire
+from multidrop.sim.wire import SimulatedEnd, Wire
 
 _log = logging.getLogger("multidrop.sim")
 
