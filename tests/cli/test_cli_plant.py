@@ -176,7 +176,7 @@ def test_drive_commands_accept_a_plant_file_and_a_drive_name(
     assert toy["control"] == 0
 
 
-def test_start_and_write_refuse_a_drive_name_in_another_unicode_form(
+def test_only_stops_and_reads_accept_a_drive_name_in_another_unicode_form(
     run: Run, tmp_path: Path, port: str, toy: SimulatedDrive
 ) -> None:
     """Depending on the keyboard, a u with two dots is one character (U+00FC) or two (U+0075 U+0308)."""

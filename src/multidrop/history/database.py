@@ -21,7 +21,7 @@ TABLE = (
     "create temp table recorded (time timestamptz_ns, monotonic_ns bigint, uncertainty_ns bigint,"
     " drive varchar, register varchar, value double, status varchar)"
 )
-# A value for buckets: one infinite value would make the mean of its bucket infinite.
+# SQL for a value in a bucket: null unless it is finite, because one infinite value makes the mean infinite.
 FINITE = "case when isfinite(value) then value end"
 FORM = "format parquet, compression zstd"
 

@@ -266,6 +266,6 @@ class KeptSeries:
         return sum(len(rows.times) for rows in self._kept.values())
 
     def _found(self, series: Series, batches: range) -> SeriesRows:
-        """Return the series' cached rows, or no rows if there is a gap between them and `batches`."""
+        """Return the series' cached rows if `batches` starts within or directly after them, else no rows."""
         rows = self._kept.pop(series, None)
         return rows if rows and rows.first <= batches.start <= rows.past else SeriesRows(batches.start)

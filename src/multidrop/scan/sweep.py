@@ -139,7 +139,7 @@ def _patient(sweep: Sweep) -> Sweep:
 
 
 def _settings(families: Sequence[type[Drive]]) -> dict[Setting, dict[type[Drive], float]]:
-    """Return, for each line setting, how likely each family uses it.
+    """Return, for each line setting, the likelihood that a drive of each family uses it.
 
     The first setting in a family's manual is the likeliest.
     """
@@ -158,8 +158,7 @@ def _sweeps(
 ) -> Iterator[tuple[float, Sweep]]:
     """Yield sweeps, with their likelihoods, that together find drives of every family at this setting.
 
-    There are as few sweeps as possible. Each one reads the register that exists in the most families for
-    which there is no sweep yet.
+    Each sweep reads the register that drives of the most remaining families answer.
     """
     left = dict(weights)
     while left:

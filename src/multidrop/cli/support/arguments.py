@@ -169,7 +169,9 @@ def opening_of(arguments: argparse.Namespace, line: PlantLine | None) -> tuple[R
         return rs485, 0.0 if arguments.settle is None else parse_duration(arguments.settle)
     for name in ("rs485", "settle"):
         if getattr(arguments, name) is not None:
-            raise ValueError(f"--{name} cannot be used with a plant file. Write key {name!r} in that file")
+            raise ValueError(
+                f"--{name} cannot be used with a plant file. Write key {name!r} in the table of {line.name!r}"
+            )
     return line.rs485, line.settle
 
 
