@@ -27,7 +27,7 @@ from multidrop.plant.model import Plant, PlantLine, PolledDrive
 from multidrop.poller import Poller
 from multidrop.sim import EncodedDrive, SimulatedDrive, Simulator, Wire, simulated
 from multidrop.transport import drive_records
-from multidrop.transport.drive_records import make_exchange
+from multidrop.transport.drive_reads import make_exchange
 from multidrop.transport.exchange import READ_ATTEMPTS
 
 

@@ -348,9 +348,8 @@ def test_one_byte_codes_are_assigned_in_the_order_of_use() -> None:
     table = CodeTable([f"name {number}" for number in range(400)])
     assert bytes(table.narrow(memoryview(array("H", [9, 0, 9, 399]))) or b"") == bytes([0, 1, 0, 2])
     assert table.used == ("name 9", "name 0", "name 399")
-    assert (
-        table.narrow(memoryview(array("H", range(256)))) is None
-    )  # too many codes for one byte: with "name 399" they are 257
+    # too many codes for one byte: with "name 399" they are 257
+    assert table.narrow(memoryview(array("H", range(256)))) is None
     table.forget()
     assert bytes(table.narrow(memoryview(array("H", range(256)))) or b"") == bytes(range(256))
     with pytest.raises(ValueError, match="status 400 has no name"):

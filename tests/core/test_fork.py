@@ -296,12 +296,8 @@ with Simulator([Wire([simulated(Toy(1))], unpaced=True)]) as simulator:
 
 @pytest.mark.long
 def test_the_exit_of_a_child_does_not_end_the_parents_simulator() -> None:
-    shown = [
-        "-W",
-        "ignore",
-        "-W",
-        "always::ResourceWarning",
-    ]  # a socket that the child leaves open is reported on stderr
+    # a socket that the child leaves open is reported on stderr
+    shown = ["-W", "ignore", "-W", "always::ResourceWarning"]
     words = [sys.executable, *shown, "-c", LEFT.format(support=str(Path(toy.__file__).parent))]
     done = subprocess.run(words, capture_output=True, text=True, timeout=PATIENCE, check=False)
     assert (done.stdout, done.stderr, done.returncode) == ("0\n", "", 0)

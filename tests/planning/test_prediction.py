@@ -28,7 +28,7 @@ from multidrop.planning.prediction import LATENESS, Suggestions, duration_text, 
 from multidrop.planning.prediction import predict as predict_with_host
 from multidrop.planning.schedule import TURN_SHARE
 from multidrop.sim import EncodedDrive
-from multidrop.transport.drive_records import make_exchange
+from multidrop.transport.drive_reads import make_exchange
 
 BIT = 1 / 9600
 predict = partial(predict_with_host, lateness=0.0)

@@ -30,7 +30,7 @@ from multidrop.polling.jobs import JobMaker
 from multidrop.polling.polled_line import PolledLine
 from multidrop.sim import Faults, SimulatedDrive, simulated
 from multidrop.transport import clock
-from multidrop.transport.drive_records import NO_ROWS, make_exchange
+from multidrop.transport.drive_reads import NO_ROWS, make_exchange
 
 # ---- silent drives ----
 

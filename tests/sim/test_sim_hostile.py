@@ -22,7 +22,7 @@ from multidrop.sim import DriveFaults, Faults, FaultyWire, SimulatedDrive, Simul
 from multidrop.sim.faults import overload_code, rates_of
 from multidrop.sim.motor import MotorDrive
 from multidrop.toml_check import parse_duration
-from multidrop.transport.drive_records import make_exchange
+from multidrop.transport.drive_reads import make_exchange
 from multidrop.transport.line import Line
 
 READ = checksums.rtu("01 03 00 02 00 01")

@@ -1,8 +1,8 @@
 """A late reply is never taken for the reply to another request.
 
-If a late reply could be mistaken for a request's reply, the C core sends a probe first. A probe (`proof` in
-the code) is a read whose reply no late reply can resemble. The last tests reopen a port to which late replies
-come, in this process or after another one.
+If a late reply could be mistaken for a request's reply, the C core sends a proof first: a read whose reply no
+late reply can resemble. The last tests reopen a port to which late replies come, in this process or after
+another one.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ AGAIN = Message(1, 6, 9, data=words(1))
 
 @pytest.fixture
 def proof(line: LineDriver, drive: Peer) -> Exchange:
-    """Let READ time out, and the time for its late reply pass. Return a probe, which reads more registers."""
+    """Let READ time out, and the time for its late reply pass. Return a proof, which reads more registers."""
     found = exchange(LONGER, drive)
     drive.prove_by([found])
     time_out(line, drive, READ)
@@ -71,7 +71,7 @@ def test_a_write_waits_for_the_reply_to_an_earlier_write(line: LineDriver, drive
 
 
 @pytest.mark.parametrize("late", [0, 1])
-def test_an_answered_probe_ends_the_wait_for_late_replies(
+def test_an_answered_proof_ends_the_wait_for_late_replies(
     line: LineDriver, drive: Peer, proof: Exchange, late: int
 ) -> None:
     line.send(proof)
@@ -84,9 +84,7 @@ def test_an_answered_probe_ends_the_wait_for_late_replies(
     assert line.data_after(reply(2222)) == words(2222)
 
 
-def test_requests_still_wait_if_a_probe_for_late_replies_is_unanswered(
-    line: LineDriver, drive: Peer, proof: Exchange
-) -> None:
+def test_requests_still_wait_if_a_proof_is_unanswered(line: LineDriver, drive: Peer, proof: Exchange) -> None:
     line.send(proof)
     line.wait_until_done()
     assert line.completion.result == Failure.NO_REPLY
@@ -95,7 +93,7 @@ def test_requests_still_wait_if_a_probe_for_late_replies_is_unanswered(
 
 
 def ask_in_vain(line: LineDriver, drive: Peer, proof: Exchange) -> None:
-    """Let the drive answer another request, but neither READ nor the probe."""
+    """Let the drive answer another request, but neither READ nor the proof."""
     ask(line, drive, Message(1, 4, 50, 1))
     line.receive(build_reply(Framing.RTU, Message(1, 4, data=words(2222))))
     assert line.completion.result > 0
@@ -106,7 +104,7 @@ def ask_in_vain(line: LineDriver, drive: Peer, proof: Exchange) -> None:
     line.now = drive.late_until_ns + MS
 
 
-def test_requests_no_longer_wait_after_two_unanswered_probes(
+def test_requests_no_longer_wait_after_two_unanswered_proofs(
     line: LineDriver, drive: Peer, proof: Exchange
 ) -> None:
     """Some devices do not reply to reads of registers that they do not have."""
@@ -117,7 +115,7 @@ def test_requests_no_longer_wait_after_two_unanswered_probes(
 
 
 @pytest.mark.parametrize("is_late", [True, False])
-def test_requests_wait_for_a_probe_if_the_drive_answered_one_before(
+def test_requests_wait_for_a_proof_if_the_drive_answered_one_before(
     line: LineDriver, drive: Peer, proof: Exchange, is_late: bool
 ) -> None:
     if is_late:
@@ -130,7 +128,7 @@ def test_requests_wait_for_a_probe_if_the_drive_answered_one_before(
     assert is_barred(line, drive, OTHER)
 
 
-def test_requests_wait_for_a_probe_while_the_drive_is_silent(
+def test_requests_wait_for_a_proof_while_the_drive_is_silent(
     line: LineDriver, drive: Peer, proof: Exchange
 ) -> None:
     for _ in range(3):
@@ -141,7 +139,7 @@ def test_requests_wait_for_a_probe_while_the_drive_is_silent(
 
 
 @pytest.mark.usefixtures("proof")
-def test_a_stop_is_sent_without_a_probe_for_late_replies(line: LineDriver, drive: Peer) -> None:
+def test_a_stop_is_sent_without_a_proof(line: LineDriver, drive: Peer) -> None:
     time_out(line, drive, WRITE)
     stop = exchange(AGAIN, drive)
     stop.c.insists = 1
@@ -215,7 +213,7 @@ def test_a_reply_is_not_trusted_if_it_may_answer_another_request(line: LineDrive
 
 
 @pytest.mark.usefixtures("proof")
-def test_a_reply_after_an_answered_probe_cannot_be_late(
+def test_a_reply_after_an_answered_proof_cannot_be_late(
     line: LineDriver, drive: Peer, proof: Exchange
 ) -> None:
     line.send(proof)
@@ -225,7 +223,7 @@ def test_a_reply_after_an_answered_probe_cannot_be_late(
 
 @pytest.fixture
 def first(drive: Peer) -> Exchange:
-    """Return the probe of a drive whose first reply may answer another process's READ."""
+    """Return the proof of a drive whose first reply may answer another process's READ."""
     found = exchange(LONGER, drive)
     drive.prove_by([found, exchange(Message(1, 3, 0, 3), drive)])
     drive.doubt_first_reply()
@@ -236,7 +234,7 @@ def is_in_doubt(line: LineDriver) -> bool:
     return line.want == "done" and line.completion.result == Failure.LATE_ANSWER_DUE
 
 
-def test_replies_are_accepted_after_an_answered_probe(line: LineDriver, drive: Peer, first: Exchange) -> None:
+def test_replies_are_accepted_after_an_answered_proof(line: LineDriver, drive: Peer, first: Exchange) -> None:
     ask(line, drive, READ)
     line.receive(reply(7777))  # the reply to another process's READ
     assert is_in_doubt(line)
@@ -279,14 +277,14 @@ def test_a_stop_accepts_a_first_reply_that_may_be_late(line: LineDriver, drive: 
         assert line.completion.result > 0
 
 
-def test_the_first_reply_is_accepted_if_the_drive_has_no_probe(line: LineDriver, drive: Peer) -> None:
+def test_the_first_reply_is_accepted_if_the_drive_has_no_proof(line: LineDriver, drive: Peer) -> None:
     drive.doubt_first_reply()
     ask(line, drive, READ)
     assert line.data_after(reply(1111)) == words(1111)
 
 
 @pytest.mark.parametrize("least", [0, 1, 0xFFFF])
-def test_probe_reply_is_accepted_only_with_the_known_value(line: LineDriver, drive: Peer, least: int) -> None:
+def test_proof_reply_is_accepted_only_with_the_known_value(line: LineDriver, drive: Peer, least: int) -> None:
     """The value can be 0, as that of Delixi's P04.28 is at 1200 baud."""
     known = exchange(READ, drive, answer=(least, least))
     drive.prove_by([known, exchange(OTHER, drive, answer=(7, 7))])

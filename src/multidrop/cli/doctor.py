@@ -62,7 +62,8 @@ from multidrop.errors import LineError
 from multidrop.families.registry import find_model
 from multidrop.planning.blocks import first_block
 from multidrop.plant.model import Plant
-from multidrop.transport.drive_records import LEAST_TIMEOUT, make_exchange
+from multidrop.transport.drive_reads import make_exchange
+from multidrop.transport.drive_records import LEAST_TIMEOUT
 from multidrop.transport.line import Line
 from multidrop.transport.network_port import mixed_up, other_port, spoken_on
 from multidrop.transport.port_identity import lasting_name

@@ -14,7 +14,7 @@ from multidrop.planning.blocks import Block, Plan, may_be_too_long, plan, sendin
 from multidrop.planning.bus_time import kind, silence
 from multidrop.planning.schedule import Job, Schedule, Turn
 from multidrop.plant.model import PolledDrive
-from multidrop.transport.drive_records import make_read
+from multidrop.transport.drive_reads import make_read
 
 MOST_NAMES = 1 << 16  # number of names that uint16 codes can distinguish
 

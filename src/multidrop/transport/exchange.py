@@ -24,14 +24,8 @@ from multidrop.errors import (
 )
 from multidrop.planning.blocks import Block, blocks, halves, least, text_blocks
 from multidrop.transport import clock
-from multidrop.transport.drive_records import (
-    NO_ROWS,
-    Peers,
-    PreparedRead,
-    PreparedReads,
-    make_exchange,
-    make_read,
-)
+from multidrop.transport.drive_reads import NO_ROWS, PreparedRead, PreparedReads, make_exchange, make_read
+from multidrop.transport.drive_records import Peers
 from multidrop.transport.line import Line
 from multidrop.transport.network_port import mixed_up, silence_hint
 from multidrop.transport.open_port import STALLED

@@ -30,7 +30,7 @@ from multidrop.polling.batch import Row
 from multidrop.sim import FaultyWire
 from multidrop.sim import wire as wire_of_drives
 from multidrop.transport import clock, drive_records
-from multidrop.transport.drive_records import NO_ROWS, make_exchange
+from multidrop.transport.drive_reads import NO_ROWS, make_exchange
 
 S = 1_000_000_000
 BEGIN_NS = 1000 * S

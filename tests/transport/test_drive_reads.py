@@ -36,8 +36,8 @@ from multidrop.planning.blocks import Block
 from multidrop.planning.bus_time import silence
 from multidrop.poller import Poller
 from multidrop.sim import EncodedDrive, SimulatedDrive, Simulator, Wire, proof
-from multidrop.transport import drive_records
-from multidrop.transport.drive_records import BlockDecoder, decoder_of
+from multidrop.transport import drive_reads
+from multidrop.transport.drive_reads import BlockDecoder, decoder_of
 
 WANTED = (Toy.output_frequency, Toy.mystery, Toy.acceleration_time)
 
@@ -47,7 +47,7 @@ class Counted:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.plans = self.made = 0
-        blocks, make_read = drive_records.blocks, drive_records.make_read
+        blocks, make_read = drive_reads.blocks, drive_reads.make_read
 
         def choose(*given: Any) -> Any:
             self.plans += 1
@@ -57,8 +57,8 @@ class Counted:
             self.made += 1
             return make_read(*given, **details)
 
-        monkeypatch.setattr(drive_records, "blocks", choose)
-        monkeypatch.setattr(drive_records, "make_read", make)
+        monkeypatch.setattr(drive_reads, "blocks", choose)
+        monkeypatch.setattr(drive_reads, "make_read", make)
 
     def since(self) -> tuple[int, int]:
         """Return the numbers of plans and new exchanges since the last call."""
@@ -150,7 +150,7 @@ def test_a_cached_read_uses_changed_settings(bus: Bus, name: str, value: object)
 
 
 def test_the_number_of_cached_read_plans_is_limited(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(drive_records, "MOST_PREPARED", 3)
+    monkeypatch.setattr(drive_reads, "MOST_PREPARED", 3)
     drive = bus.attach(PatientToy, 1)
     for wanted in permutations(WANTED):
         assert set(drive.read_many(wanted)) == {register.name for register in WANTED}
