@@ -91,7 +91,7 @@ class ChannelSet:
         self._statuses = [UNSEEN] * size
         self._sent_ns = [0] * size
         self._known_ns: dict[int, int] = {}  # monotonic time of the newest known value, by index
-        self._gaps: set[int] = set()  # indexes of channels for which a value is too old
+        self._gaps: set[int] = set()  # indexes of channels that use a value which is too old
         self._holds_ns = [round(hold_s * 1e9) for hold_s in series.holds_s]
         # UTC in ns of the newest value in the restored totals, by channel index
         self._restored_ns: dict[int, int] = {}
@@ -232,7 +232,10 @@ class ChannelSet:
         fresh.add(row.slot)
 
     def _status(self, slots: Iterable[int]) -> int:
-        """Return the status of a row that is computed from the newest rows of the given series."""
+        """Return the status of a row that is computed from the newest rows of the given series.
+
+        If some of these rows have no value, it is the status of the newest of them.
+        """
         missing = [slot for slot in slots if self._statuses[slot] not in (Status.OK, UNSEEN)]
         if missing:
             return self._statuses[max(missing, key=self._sent_ns.__getitem__)]

@@ -119,9 +119,9 @@ def predict(
     turn = [job for job in jobs if job.planned.every is None]
     load = sum(job.cost / job.planned.every for job in jobs if job.planned.every)
     turns = max(TURN_SHARE, 1 - load) / sum(job.cost for job in turn) if turn else 0.0
-    # if a drive needs pauses between its requests, the line may be idle during these pauses
-    has_rests = any(job.planned.drive.least_interval for job in jobs)
-    if has_rests:
+    # the line may be idle during a drive's least interval between requests
+    has_intervals = any(job.planned.drive.least_interval for job in jobs)
+    if has_intervals:
         load += sum(job.cost * job.reached for job in turn)
     groups: dict[tuple[Drive, float | None], list[_PredictedJob]] = {}
     cycle, switched, before = 0.0, 0, jobs[-1].planned.drive
@@ -131,24 +131,24 @@ def predict(
         switched += switches(before, drive)
         before = drive
         groups.setdefault((drive, job.planned.every), []).append(job)
-    if has_rests:
-        cycle = max(cycle, *_rests(jobs).values())
+    if has_intervals:
+        cycle = max(cycle, *_drive_cycles(jobs).values())
     rates = [
         Rate(
             drive,
             every,
             registers=tuple(register for job in group for register in job.planned.block.registers),
             requests=len(group),
-            reached=turns if every is None and not has_rests else min(job.reached for job in group),
+            reached=turns if every is None and not has_intervals else min(job.reached for job in group),
         )
         for (drive, every), group in groups.items()
     ]
-    utilisation = load if has_rests or not turn else max(load, 1.0)
+    utilisation = load if has_intervals or not turn else max(load, 1.0)
     return Prediction(cycle, switched, utilisation, tuple(rates))
 
 
-def _rests(jobs: Iterable[_PredictedJob]) -> dict[Drive, float]:
-    """Return, by drive, the time in s to carry out each of its jobs once, with silences and pauses."""
+def _drive_cycles(jobs: Iterable[_PredictedJob]) -> dict[Drive, float]:
+    """Return the time in s to carry out each job of a drive once, with its least intervals, by drive."""
     found: dict[Drive, float] = {}
     for job in jobs:
         drive = job.planned.drive

@@ -1,12 +1,12 @@
 """Decide which exchange of a line is carried out next. Callers pass the time, in ns.
 
 The exchanges are planned in advance, up to a horizon, so that the line never waits for Python. A job with a
-period has one slot (a time interval in which it is carried out) in each period. Slots start at multiples of
-the period and never drift. Among the started slots, the slot that ends first goes first. If there is time for
-all of them, jobs with equal line settings and silence are sent one after another. A slot that ends before its
-turn is counted and skipped for good. Then, until the line has caught up, the job that has waited longest goes
-first, so that each job is carried out. Jobs without a period take turns, one round after another, in the
-remaining time. They have a minimum share of the line's time. Silent drives get few requests: see `BackOff`.
+period is due at each multiple of the period and never drifts. Among the jobs that are due, the job whose
+period ends first goes first. If there is time for all of them, jobs with equal line settings and silence are
+sent one after another. If a job's period ends before its turn, this poll is counted and skipped for good.
+Then, until the line has caught up, the job that has waited longest goes first, so that each job is carried
+out. Jobs without a period take turns, one round after another, in the remaining time. They have a minimum
+share of the line's time. Silent drives get few requests: see `BackOff`.
 """
 
 from __future__ import annotations

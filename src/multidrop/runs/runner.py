@@ -357,7 +357,9 @@ class _Session:
         now_ns = clock.boottime_ns()
         still_s = (now_ns - self._looked_ns) / 1e9
         if still_s > STILL_S:
-            raise _Aborted(f"the process of the run was suspended for {still_s:.1f} s")
+            raise _Aborted(
+                f"the limits were not checked for {still_s:.1f} s: the process was suspended or too slow"
+            )
         self._looked_ns = now_ns
 
     def _limit_ns(self) -> float:
