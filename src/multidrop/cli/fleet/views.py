@@ -144,7 +144,7 @@ def picture(fleet: FleetState, size: tuple[int, int], head: str) -> list[TextLin
 
 
 def _body(fleet: FleetState, width: int, room: int) -> list[str]:
-    """Return three tables: all gateways, then as many lines and recent changes of masters as fit."""
+    """Return rows of text: all gateways, problems, then as many lines and changes of masters as fit."""
     begin = [
         *gateway_table(fleet, width - 1),
         "",

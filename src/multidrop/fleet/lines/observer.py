@@ -204,7 +204,7 @@ class Observer:
         return self.ended > before
 
     def _remember_ended_sessions(self) -> None:
-        """Remember the sessions that are over; `restart_waits` restarts the times that show this."""
+        """Remember the sessions that are over, so that `restart_waits` does not make them alive again."""
         for name in {name for follower in self.paths for name in follower.records}:
             session = max((record.value["session"] for _, record in self._of(name)), default=0)
             if self.is_over(name, session):
