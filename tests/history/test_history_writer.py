@@ -87,7 +87,7 @@ def test_closing_a_history_writer_writes_all_rows(tmp_path: Path, writers: Write
     assert writer.state().dropped == 20
 
 
-def test_batches_are_recorded_if_number_0_means_different_drives(tmp_path: Path, writers: Writers) -> None:
+def test_batches_of_several_pollers_are_recorded(tmp_path: Path, writers: Writers) -> None:
     """Batches come from several pollers, and each poller numbers its drives from 0."""
     writer = writers(tmp_path)
     taken = [

@@ -227,7 +227,7 @@ def wake_finding(
     `realtime` is the lateness under realtime scheduling, or the reason why the system refuses it.
     `is_realtime` is the plant file's key `realtime`. The 99th percentile of the lateness must be below t3.5,
     the silence before each request. If multidrop switches the RTS signal, even the greatest lateness must be
-    below t3.5, because a drive may answer after t3.5. Until RTS is switched, the reply is cut off.
+    below t3.5: a drive may answer after t3.5, and a later switch would cut off the start of its reply.
     """
     limit, kind = settings.t3_5, "max" if switch in _LEVELS else "p99"
 

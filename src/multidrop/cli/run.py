@@ -126,7 +126,7 @@ def _screen(test: TestRun, arguments: argparse.Namespace) -> Iterator[list[Calla
         def show(rows: Rows) -> None:
             nonlocal is_ending
             table.add(rows)
-            # Ctrl-C printed a message: draw the next table below it, not over it.
+            # The signal printed a message: draw the next table below it, not over it.
             if not is_ending and signal_has_come():
                 is_ending = True
                 table.keep_drawing(time.monotonic())
