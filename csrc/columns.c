@@ -214,7 +214,7 @@ int md_values(const struct md_block *block, const struct md_message *reply, doub
 
 struct md_columns *md_columns_new(size_t room)
 {
-    /* number of columns with 8 bytes per row, and of those with 2 bytes per row */
+    /* number of columns with 8 bytes per row, and with 2 bytes per row */
     enum { WIDE = 4, NARROW = 3 };
     struct md_columns *columns = malloc(sizeof *columns + room * (WIDE * 8 + NARROW * 2) + (room + 7) / 8);
     if (!columns)

@@ -120,8 +120,8 @@ int64_t md_timeout_ns(const struct md_exchange *exchange);
 /* Return the time, with a margin, within which a reply starts after its request; 0 if the drive's delays vary
  * too much or are not known well enough. */
 int64_t md_reply_due_ns(const struct md_exchange *exchange);
-/* Learn from a reply's delay and return the best estimate of it. With `is_whole`, the first read found the
- * whole reply, so `delay_ns` is only an upper bound. */
+/* Learn from a reply's delay, and return the best estimate of the delay. With `is_whole`, the first read
+ * found the whole reply, so `delay_ns` is only an upper bound. */
 int64_t md_learn_delay(const struct md_exchange *exchange, int64_t delay_ns, int is_whole);
 /* Use a longer timeout, because a late reply came `delay_ns` after its request. If the request was sent
  * several times, `delay_ns` counts from the last time and `is_exact` is 0. */

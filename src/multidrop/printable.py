@@ -88,7 +88,7 @@ def did_you_mean(name: str, known: Iterable[str], otherwise: str = "", most: int
 
 
 def install_command(*extras: str) -> str:
-    """Return the pip command for the libraries of these extras.
+    """Return the pip command for the libraries of the extras.
 
     The command names each library, because pip finds `multidrop[extra]` only in the directory of the sources.
     The names of the extras follow as a shell comment.

@@ -1,4 +1,4 @@
-"""The steps of which a user's drive class builds its methods, such as `value = yield from read(register)`."""
+"""The steps for the methods of a user's drive class, such as `value = yield from read(register)`."""
 
 from multidrop.drive.verbs import Script as Script
 from multidrop.drive.verbs import insist as insist

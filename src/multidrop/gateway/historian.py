@@ -156,7 +156,7 @@ class Historian:
         return f'{{"step_ms":{step / MS_NS},"series":{{{",".join(pieces)}}}}}'.encode()
 
     def export(self, names: Sequence[str], begin: int, end: int, kind: str) -> Iterator[bytes]:
-        """Return an iterator over the pieces of a file with the values of these registers.
+        """Return an iterator over the pieces of a file with the values of the named registers.
 
         If `names` is empty, the file has all registers. `kind` is "csv" or "parquet".
 

@@ -114,7 +114,7 @@ class GrowingSegment:
     def rows_of(
         self, batch: IndexedBatch, series: frozenset[Series] | None, begin: int, end: int
     ) -> list[Row]:
-        """Return a batch's rows of these series (None: all series) with begin <= time < end, in ns."""
+        """Return a batch's rows of the given series (None: all series) with begin <= time < end, in ns."""
         columns = self._tail.again(batch.place)
         wanted = None if series is None else _codes(columns.drives, columns.registers, series)
         return list(_rows(columns, wanted, begin, end))

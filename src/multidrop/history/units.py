@@ -108,7 +108,7 @@ class UnitHistory:
         self.learn(known)
 
     def learn(self, known: Mapping[int, FileUnits]) -> None:
-        """Add the units of these segments. Columns that were already assigned to a unit stay the same."""
+        """Add the units of new segments. Columns that were already assigned to a unit stay the same."""
         before: FileUnits | None = None
         for number in sorted(known.keys() - self._known.keys(), reverse=True):
             self._known[number] = found = known[number]
@@ -143,7 +143,7 @@ class UnitHistory:
         ]
 
     def described(self, metadata: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the metadata with the units of all registers, also of those such as "load [A]"."""
+        """Return the metadata with the units of all registers, including columns such as "load [A]"."""
         columns = {series: (series[1], unit) for series, unit in self.newest.items()}
         drives = {name: dict(_table(about)) for name, about in _table(metadata.get("drives")).items()}
         said = units_by_series(metadata)

@@ -73,7 +73,7 @@ def scaled(details: dict[str, Any], step: Any, offset: Any = 0) -> None:
 
     A step of 0 means that no step is given.
 
-    Raises ValueError if one of them is not a number.
+    Raises ValueError if `step` or `offset` is not a number.
     """
     step, offset = number(step, 1, "scale"), number(offset, 0, "offset")
     if step not in (0, 1):

@@ -54,7 +54,7 @@ def read_sunspec(document: Mapping[str, Any]) -> list[ImportedDevice]:
                 _add(device, point, name, address + at * size, names)
         address += size * count
     if FIRST < address <= 0x10000:
-        # All addresses of a SunSpec model have registers, so one read may include any of them.
+        # All addresses of a SunSpec model have registers, so one read may include any addresses.
         device.readable = range(FIRST, address)
     for register in device.registers:
         _tie(register, names)

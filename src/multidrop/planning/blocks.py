@@ -127,7 +127,7 @@ def first_block(drive: Drive) -> Block | None:
 def all_requests(
     drive: Drive, registers: Iterable[Register[Any]]
 ) -> Iterator[tuple[int, tuple[Register[Any], ...], int, int]]:
-    """Yield every allowed request that reads some of these registers.
+    """Yield every allowed request that reads at least one of the registers.
 
     Each request is a tuple (count, registers, begin, end): `count` is its number of addresses, `registers`
     are all registers of the read space in order of address, and the request reads `registers[begin:end]`.

@@ -24,7 +24,7 @@ from multidrop.planning.bus_time import gap, in_order, kind, silence, switches
 from multidrop.planning.schedule import TURN_SHARE, Job, Schedule
 
 LATENESS = 100e-6  # seconds that a typical computer adds to each exchange, to wake up and to write
-ENOUGH = 0.97  # a rate counts as reached if at least this fraction of it is reached
+ENOUGH = 0.97  # fraction of a wanted rate from which the rate counts as reached
 LEAST_EXCHANGES = 1000  # least number of simulated exchanges
 LEAST_ROUNDS = 3  # least number of simulated exchanges per job
 FAR_NS = 1 << 62
@@ -284,9 +284,9 @@ SLOWER = 1.05  # factor between one period that is tried and the next
 
 @dataclass(frozen=True)
 class Suggestions:
-    """Three changes to a line, each of which alone lets the line reach its rates.
+    """Three changes to a line. Each change alone lets the line reach its rates.
 
-    `baudrate` and `registers` are None if no value of them is enough.
+    `baudrate` and `registers` are None if no value is enough.
     """
 
     every: tuple[tuple[float, float], ...]  # pairs of a wanted period and a period that can be reached, in s

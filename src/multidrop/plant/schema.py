@@ -125,7 +125,7 @@ def _inherited(families: _Families) -> Iterator[dict[str, Any]]:
 
 
 def _facts(**values: list[str]) -> dict[str, Any]:
-    """Return a JSON Schema that is met if each of these keys has one of the given values."""
+    """Return a JSON Schema that is met if each key has one of its given values."""
     return {"properties": {key: {"enum": each} for key, each in values.items()}, "required": [*values]}
 
 

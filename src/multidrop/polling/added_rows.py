@@ -261,7 +261,7 @@ class TotalsFile:
         return found if isinstance(found, dict) else {}
 
     def write(self, totals: dict[str, Any]) -> None:
-        """Queue a write of these totals, which replace the file's content."""
+        """Queue a write of the totals, which replace the file's content."""
         self._waiting = totals
         self._thread.put(self._write)
 

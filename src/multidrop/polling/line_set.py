@@ -174,7 +174,7 @@ class LineSet:
         return line
 
     def put_in_order(self, names: Sequence[str]) -> None:
-        """Sort the lines into the order of these names."""
+        """Sort the lines into the order of `names`."""
         places = {name: place for place, name in enumerate(names)}
         self._lines = tuple(sorted(self._lines, key=lambda line: places[line.name]))
 
@@ -202,7 +202,7 @@ class LineSet:
             self._free.append(line.number)
 
     def end(self, lines: Iterable[PolledLine], why: str) -> None:
-        """End the exchanges of these lines and close their ports; waiting calls fail with the text `why`."""
+        """End the exchanges of the lines and close their ports; waiting calls fail with the text `why`."""
         going = list(lines)
         with ExitStack() as stack:
             for line in reversed(going):

@@ -218,7 +218,7 @@ class AppendFile:
         self._is_truncated = False  # True if the last piece was appended only in part
 
     def append(self, piece: bytes | memoryview) -> None:
-        """Append the whole piece, or none of it.
+        """Append the whole piece, or nothing.
 
         After an error, the file is truncated to its former length, at the latest by the next `append`.
         """
@@ -228,7 +228,7 @@ class AppendFile:
         written = 0
         try:
             while written < len(piece):
-                # Release the view here: a buffer cannot grow while a traceback keeps a view of it.
+                # Release the view here: a buffer cannot grow while a traceback keeps a view.
                 with memoryview(piece)[written:] as left:
                     written += self._file.write(left)
         except BaseException:

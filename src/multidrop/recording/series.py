@@ -159,7 +159,7 @@ class SeriesWriter(RecordingWriter):
         self._waiting_rows = 0
         self._trigger = trigger_of(metadata)
         self._is_closed = False
-        self.begin_ns: int | None = None  # time of the earliest row of those that were written first, ns UTC
+        self.begin_ns: int | None = None  # earliest time in the batch that was written first, ns UTC
 
     @property
     def statuses(self) -> list[str]:

@@ -147,6 +147,6 @@ class TriggeredWriter(RecordingWriter):
 
     def close(self) -> None:
         """Close the recordings in progress, even if `post` seconds have not passed since their trigger."""
-        with ExitStack() as stack:  # the stack closes all recordings, even if closing one of them fails
+        with ExitStack() as stack:  # the stack closes all recordings, even if one close fails
             while self._open:
                 stack.callback(self._open.pop().writer.close)

@@ -272,7 +272,7 @@ def _line_use(recording: Recording, line: str, planned: Mapping[str, Any]) -> Li
     time, needed, silence = (np.concatenate(column) for column in zip(*parts, strict=True))
     order = np.argsort(time, kind="stable")
     time, needed, silence = time[order], needed[order], silence[order]
-    if len(time):  # the silence between two exchanges is the longer one of those that their drives need
+    if len(time):  # the silence between two exchanges is the longer of the two that their drives need
         needed = needed + np.maximum(silence, np.concatenate([silence[1:], silence[-1:]]))
         # Some ports, such as network ports, are faster than their baud rate: limit the needed time to the
         # measured time.

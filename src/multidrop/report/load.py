@@ -194,7 +194,7 @@ class Recording:
         return tuple(series for series in of_drive if register in ("", series.register))
 
     def plot(self, *, drives: Sequence[str] = (), registers: Sequence[str] = ()) -> Figure:
-        """Return a picture of these drives and registers (default: all), which a notebook shows.
+        """Return a picture of the named drives and registers (default: all), which a notebook shows.
 
         Raises ValueError for unknown names, and if there is no value to draw.
         """

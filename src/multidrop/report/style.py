@@ -78,7 +78,7 @@ class NotebookFigure(Figure):
 
 
 def new_figure(heights: Sequence[float], **details: Any) -> tuple[Figure, list[Axes]]:
-    """Return a figure with axes of these heights (inches), one below the other."""
+    """Return a figure with axes of the given heights (inches), one below the other."""
     figure = NotebookFigure(figsize=(WIDTH, sum(heights) + 0.6), layout="constrained", dpi=DPI)
     axes = figure.subplots(len(heights), 1, squeeze=False, height_ratios=list(heights), **details)[:, 0]
     for one in axes:

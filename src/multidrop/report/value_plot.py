@@ -86,7 +86,7 @@ class Content:
 def plot(
     recording: Recording, drives: Sequence[str] = (), registers: Sequence[str] = ()
 ) -> tuple[Figure, list[str]]:
-    """Return a picture of these drives and registers (default: all), and the names for which it had no room.
+    """Return a picture of drives and registers (default: all), and the names for which it had no room.
 
     Raises ValueError for unknown names, and if there is no value to draw.
     """

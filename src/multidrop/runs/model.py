@@ -149,7 +149,7 @@ class RunPlan:
 
     @property
     def drives(self) -> tuple[str, ...]:
-        """The names of the drives that get commands, and of those with a register in a condition."""
+        """The names of the drives that get commands or have a register in a condition."""
         compared = (condition.drive for condition in self.conditions)
         return tuple(dict.fromkeys([*self.commanded, *compared]))
 

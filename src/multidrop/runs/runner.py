@@ -72,7 +72,7 @@ class _Aborted(Exception):
 class TestRun:
     """The test of a test file or a RunPlan, which `run` carries out.
 
-    All drives of the plant are polled. At the end of the run all of them are stopped, in the same way as by
+    All drives of the plant are polled. At the end of the run all drives are stopped, in the same way as by
     `Poller.stop_on_exit`. A run ends after the last step, at a limit, a fault or a failed command, on Ctrl-C,
     SIGTERM and any error. `ledger` and `audit` are those of Bus. `speed` is for drives that are simulated at
     this speed: all times of the test except `silence` are divided by it.

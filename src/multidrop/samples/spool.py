@@ -69,7 +69,7 @@ class SpoolFolder:
 
     def __init__(self, path: Path, gateway: str) -> None:
         self.path = path
-        # a sentence about the newest message if only a part of it is on the disk
+        # a sentence about the newest message if only a part of the message is on the disk
         self.damage: str | None = None
         with ExitStack() as stack:
             try:

@@ -109,7 +109,7 @@ DELIXI_BAUDRATES = (1200, 2400, 4800, 9600, 19200, 38400)  # baud rates, indexed
 # character formats, indexed by P04.29: three of ASCII, then three of RTU
 DELIXI_MODBUS_FORMATS = ("7N2", "7E1", "7O1", "8N2", "8E1", "8O1")
 DELIXI_NATIVE_FORMATS = ("8N1", "8E1", "8O1")
-# the run commands (K = 02), and those of them that start the motor
+# the run commands (K = 02), and the commands that start the motor
 DELIXI_COMMANDS, DELIXI_STARTS = range(1, 5), (2, 3)
 DELIXI_RUN_SOURCE, DELIXI_FREQUENCY_SOURCE = 0, 1  # indexes of the parameters P00.00 and P00.01
 DELIXI_BY_LINE = {DELIXI_RUN_SOURCE: 2, DELIXI_FREQUENCY_SOURCE: 1}

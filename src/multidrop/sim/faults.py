@@ -360,7 +360,7 @@ class FaultyWire(Wire):
 
 
 def _ptys_up_to(name: str) -> list[int]:
-    """Open ptys until one of them has this name; return their descriptors.
+    """Open ptys until one pty has this name; return their descriptors.
 
     A new pty gets the lowest free number.
     """

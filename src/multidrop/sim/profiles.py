@@ -80,7 +80,7 @@ class ProfileDrive(MotorDrive):
             self.memory.set(register, self.memory.get(self.drive.register("reference")))
 
     def rises(self, word: int, bits: int) -> bool:
-        """Return True if the control word sets one of these bits, and the previous word set none of them."""
+        """Return True if the control word sets any of the bits, and the previous word set no such bit."""
         return bool(word & bits) and not self.word_before & bits
 
     def power_cycle(self) -> None:

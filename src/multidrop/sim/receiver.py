@@ -15,7 +15,7 @@ MOST_RTU = 256
 TCP_HEAD, MOST_TCP = 6, 260  # number of bytes before the unit id; length of the longest frame
 MOST_TEXT = 513
 LEAST_RTU = 4  # bytes of the shortest frame: address, function code, CRC
-# Function codes of requests. A byte can be a request's address only if one of these codes follows it.
+# Function codes of requests. A byte can be a request's address only if a function code follows it.
 _REQUESTS = frozenset(code for code in range(256) if parse_request(Framing.RTU, bytes([1, code]))[0] == 0)
 
 

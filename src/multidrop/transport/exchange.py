@@ -172,7 +172,7 @@ class Exchanges:
         insists: bool = False,
         timeout: float = 0.0,
     ) -> dict[str, Any]:
-        """Return the values of these registers (Register objects or names), by name.
+        """Return the values of the registers (Register objects or names), by name.
 
         One request reads a block of adjacent registers. Each block is tried up to `attempts` times. If the
         drive does not answer a whole block, its parts are read instead, also by later calls until the port is

@@ -154,7 +154,7 @@ class RFC2217Port(rfc2217.Serial):
             self._telnet_negotiate_option(kind, content)
 
     def write(self, data: Any) -> int:
-        """Send all data without waiting. Raises SerialException if the network does not take all of it."""
+        """Send all data without waiting. Raises SerialException if the network does not take all data."""
         self._internal_raw_write(bytes(data).replace(_IAC, _IAC + _IAC))
         return len(data)
 
@@ -172,7 +172,7 @@ class RFC2217Port(rfc2217.Serial):
 
 # ---- Modbus TCP (tcp://) and RTU over TCP (socket://) confused in a port's name ----
 #
-# A gateway is set to one of these protocols. To requests of the other protocol it is silent, or replies with
+# A gateway is set to one protocol. To requests of the other protocol it is silent, or replies with
 # junk.
 
 

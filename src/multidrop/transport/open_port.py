@@ -411,7 +411,7 @@ class OpenPort:
         self.settings = settings
 
     def refusal(self, mask: int, baudrate: int) -> str:
-        """Return why the port refused settings; `mask` has a bit of REFUSALS for each of them."""
+        """Return why the port refused settings; `mask` has a bit of REFUSALS for each refused setting."""
         if mask != NO_DIVISOR or self._serial is None:
             return f"the port does not take the {refused_names(mask)} that the drive needs"
         true, lower, higher = possible_rates(self._serial.fileno(), baudrate)

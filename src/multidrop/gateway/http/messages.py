@@ -23,7 +23,7 @@ from multidrop.supervisor import Hung, supervisor
 
 LEAST_MS, MOST_MS = -62_135_596_800_000, 253_402_300_799_999  # years 1 to 9999, in ms since 1970
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
-# answers are compressed if their media type contains one of these words
+# answers are compressed if their media type contains one of the words
 COMPRESSIBLE = ("text", "json", "javascript", "svg", "toml")
 LEAST_COMPRESSED = 1024  # in bytes; shorter answers are not compressed
 LEVEL = 6

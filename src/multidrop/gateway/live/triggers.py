@@ -195,7 +195,7 @@ def _with_triggers_only(
 ) -> DriveSeries:
     """Return a drive's series in which only the triggers are computed; its other channels are inputs.
 
-    The poller has computed the values of these channels already. For a total, such as kWh, this matters: the
+    The poller has computed the values of the inputs already. For a total, such as kWh, this matters: the
     poller's total continues after a restart, but a total computed here would start at 0.
     """
     own = [channel for channel in drive.channels if (drive.name, channel.name) not in triggers]

@@ -220,7 +220,7 @@ class Tool:
     def _drop_rest(self) -> None:
         """Read from the PC tool once more. If that brings nothing, drop the incomplete request.
 
-        Then serve the complete requests that follow it, because one of them may be a stop.
+        Then serve the complete requests that follow it, because a stop may be among them.
         """
         self._rest = None
         if self._take_in() and self._rest is None:

@@ -51,7 +51,7 @@ def reading_function(table: Table) -> int:
 
 
 class Unavailable(Enum):
-    """The reason why polled values cannot answer a read of these addresses."""
+    """The reason why polled values cannot answer a read."""
 
     UNPOLLED = "not polled, or the words are uncertain"
     STALE = "polled, but the newest row is a miss or old"

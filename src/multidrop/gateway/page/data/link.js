@@ -36,7 +36,7 @@ export const now = () => Math.max(Date.now() + correction(), store.time + perfor
 
 const pause = ms => new Promise(done => setTimeout(done, ms));
 
-// A browser allows six connections to a gateway, and each open page occupies one of them with its pending
+// A browser allows six connections to a gateway, and each open page occupies one with its pending
 // request for a frame. So with six open pages, a command would wait. Before a page sends a command, all pages
 // therefore cancel their requests for frames. The other pages wait AGAIN_MS before they request frames again.
 const pages = new BroadcastChannel("command");

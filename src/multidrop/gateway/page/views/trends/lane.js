@@ -11,7 +11,7 @@ const LANES = [
 ];
 let serial = 0;
 
-// Draw the alarms of these drives between two times.
+// Draw the drives' alarms between two times.
 export async function draw(place, from, to, drives) {
   const mine = ++serial;
   if (!drives.length) {

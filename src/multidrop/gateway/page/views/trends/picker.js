@@ -51,7 +51,7 @@ export function choose(name) {
   draw();
 }
 
-// Select the drives of these registers, and the registers whose values are numbers, at most MOST_SIGNALS
+// Select the drives of the signals, and the registers whose values are numbers, at most MOST_SIGNALS
 // registers.
 export function chooseSignals(signals) {
   chosen = [...new Set(signals.map(({ drive }) => drive))].filter(name => store.drives.has(name));

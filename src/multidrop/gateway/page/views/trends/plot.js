@@ -11,7 +11,7 @@ import { number, registerName } from "../../ui/values.js";
 import * as markers from "./markers.js";
 import * as picker from "./picker.js";
 
-// Make the plot of one register of these drives. `set` is called with the time range that the user drags the
+// Make the plot of one register of the drives. `set` is called with the time range that the user drags the
 // mouse over.
 export function makeTrend(place, { register, unit, drives }, told, { view, set, count, stepMs }) {
   const spec = store.drives.get(drives[0]).registers.get(register);
