@@ -336,12 +336,12 @@ def test_all_mistakes_in_a_plant_file_are_reported_together(mistakes: Mistakes) 
         (
             HEAD + "baudrate = 9600\n" + FIXED,
             'line "L", drive "F": baud rate 9600 is not supported by FIXED F1; choose 38400'
-            "; the line has this value, so add baudrate = 38400 to this drive",
+            "; 9600 is the value of the line, so add baudrate = 38400 to this drive",
         ),
         (
             HEAD + 'format = "8N1"\n' + TOY + 'framing = "ascii"',
             'line "L", drive "D": format \'8N1\' is not supported by TOY T1; choose 7E1'
-            '; the line has this value, so add format = "7E1" to this drive',
+            '; 8N1 is the value of the line, so add format = "7E1" to this drive',
         ),
         (
             (HEAD + TOY).replace("family.py:Toy", "innovert-ibt"),
@@ -407,7 +407,7 @@ def test_all_mistakes_in_a_plant_file_are_reported_together(mistakes: Mistakes) 
         ),
         (
             HEAD + '[[line.drive]]\nname = "M"\nmodel = "family.py:Mute"\naddress = 1',
-            'line "L", drive "M": MUTE M1 has no readings; name the registers to poll in the key poll',
+            'line "L", drive "M": MUTE M1 has no readings; add poll = [...] with registers',
         ),
         (
             HEAD + TOY + HEAD.replace("/dev/a", "/dev/b") + FIXED,

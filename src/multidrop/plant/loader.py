@@ -362,7 +362,7 @@ def _try_each(
     for key, value in inherited.items():
         if key not in right:  # other keys, such as `silence`, are checked when the drive is created
             continue
-        hint = f"; the line has this value, so add {key} = {right[key]} to this drive"
+        hint = f"; {value} is the value of the line, so add {key} = {right[key]} to this drive"
         place.attempt(partial(model, **(least | {key: value})), hint=hint)
 
 
@@ -371,9 +371,7 @@ def _polls(
 ) -> tuple[Polled, ...]:
     if entries is None:
         if not model.readings():
-            place.wrong(
-                f"{model.title or model.__name__} has no readings; name the registers to poll in the key poll"
-            )
+            place.wrong(f"{model.title or model.__name__} has no readings; add poll = [...] with registers")
         return tuple(Polled(register, every) for register in model.readings())
     found = [_polled(entry, model, every, at) for entry, at in place.inside("poll", entries)]
     named = {polled.register for polled in found if isinstance(polled, Polled)}
