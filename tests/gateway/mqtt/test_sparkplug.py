@@ -46,7 +46,7 @@ def node(broker: Broker, host: Host, tmp_path: Path) -> Iterator[tuple[Any, Runn
     running.close()
 
 
-def test_a_sparkplug_node_publishes_birth_certificates_and_data(
+def test_a_sparkplug_node_publishes_births_deaths_and_changed_values(
     host: Host, node: tuple[Any, Running]
 ) -> None:
     known, running = node
