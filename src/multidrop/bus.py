@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from multidrop.control.call import Latches, check_expiry
+from multidrop.control.eeprom_ledger import Ledger
 from multidrop.control.exit_hook import ExitTask, exit_hook, give_signals_back, without_internals
 from multidrop.control.outcome import Seen, Stopped
 from multidrop.control.performer import Broadcaster, BusLink, Performer
-from multidrop.control.records import AuditLog, Ledger, WriteRecords
+from multidrop.control.records import AuditLog, WriteRecords
 from multidrop.control.stops import Stopper, StopRun
 from multidrop.control.writer import Writer
 from multidrop.core import RS485, Echo, Mastership, Peer, TransactionIds

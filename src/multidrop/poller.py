@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any, TypeVar, overload
 
 from multidrop.bus import Bus
+from multidrop.control.eeprom_ledger import Ledger
 from multidrop.control.exit_hook import exit_hook, give_signals_back, without_internals
-from multidrop.control.records import Ledger
 from multidrop.core import (
     REALTIME_ENDED,
     WHY_NOT_NICE,

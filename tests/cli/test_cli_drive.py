@@ -22,7 +22,7 @@ from toy import Status, Toy
 import multidrop.cli
 from multidrop.cli.support.output import confirm
 from multidrop.cli.support.values import nearest_value
-from multidrop.control import records
+from multidrop.control.eeprom_ledger import Ledger, LedgerCell
 from multidrop.core import Message
 from multidrop.errors import WriteForbidden
 from multidrop.families.innovert_ibd import InnovertIBD
@@ -377,15 +377,13 @@ def test_the_command_wear_shows_the_eeprom_ledger(run: Run, port: str, toy: Simu
     assert (status, out) == (1, "")
     assert "but only one write in 60 s is allowed" in err
     assert "no writes to EEPROM yet" in run("wear")[1]  # writes to a simulated drive are not counted
-    assert not records.Ledger().enter(
-        records.LedgerCell("/dev/ttyS7", 1, "toy", "acceleration_time"), time.time(), 60.0
-    )
+    assert not Ledger().enter(LedgerCell("/dev/ttyS7", 1, "toy", "acceleration_time"), time.time(), 60.0)
     head, row, *_ = run("wear")[1].splitlines()
     assert head.split() == ["PORT", "ADDRESS", "MODEL", "REGISTER", "WRITES", "THIS", "YEAR", "LEFT", "LAST"]
     assert row.split()[:7] == ["/dev/ttyS7", "1", "toy", "acceleration_time", "1", "1", "999"]
     (wear,) = json.loads(run("wear", "--json")[1])
     assert (wear["register"], wear["writes"], wear["left"]) == ("acceleration_time", 1, 999)
-    records.Ledger().enter(records.LedgerCell("/dev/ttyS7", 2, "meter: Meter 2", "period"), time.time(), 60.0)
+    Ledger().enter(LedgerCell("/dev/ttyS7", 2, "meter: Meter 2", "period"), time.time(), 60.0)
     assert run("wear")[1].splitlines()[2].split()[:4] == ["/dev/ttyS7", "2", "meter", "period"]
 
 

@@ -18,8 +18,9 @@ from simulated_bus import SimulatedBus, one
 
 from multidrop.cli import main
 from multidrop.control import records as write_records
+from multidrop.control.eeprom_ledger import Ledger, LedgerCell
 from multidrop.control.outcome import Effect
-from multidrop.control.records import AuditLog, Ledger, LedgerCell, noted_first, read_audit, written_by
+from multidrop.control.records import AuditLog, noted_first, read_audit, written_by
 from multidrop.core import Message
 from multidrop.core.process import flush_log
 from multidrop.errors import Unconfirmed, WriteForbidden

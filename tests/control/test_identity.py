@@ -15,6 +15,7 @@ from tables import table
 
 from multidrop import Bus, Drive, InnovertIBD, InvtCHE, NoReply, Poller, Unconfirmed, WriteForbidden
 from multidrop.control import records
+from multidrop.control.eeprom_ledger import Ledger
 from multidrop.control.outcome import Seen
 from multidrop.core import PAUSE_NS, Completion, Exchange, Failure, Framing, Message, Status, build_reply
 from multidrop.drive import Script, write
@@ -85,7 +86,7 @@ def test_no_write_is_sent_after_the_drive_was_replaced(monkeypatch: pytest.Monke
         line.sims, line.queue = (simulated(DelixiModbus(1)),), object()
         return ""
 
-    monkeypatch.setattr(records.Ledger, "enter", replace)
+    monkeypatch.setattr(Ledger, "enter", replace)
     with pytest.raises(NoReply):  # a Delixi does not answer the reads of a YD1000's identity
         drive.write("acceleration_time", 20.0)
     assert line.written == []

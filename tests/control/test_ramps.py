@@ -17,8 +17,8 @@ from simulated_bus import SimulatedBus, all_stopped, che_drives, is_write, one, 
 from tables import table
 from toy import Toy
 
+from multidrop.control.eeprom_ledger import Ledger
 from multidrop.control.ramp import ramp, start_staggered
-from multidrop.control.records import Ledger
 from multidrop.core import Message
 from multidrop.drive import Direction, Drive, Script, read
 from multidrop.drive.register import Kept, command, setting

@@ -23,16 +23,10 @@ from tables import table
 from toy import Status, Toy
 
 from multidrop.bus import Bus
-from multidrop.control import records
+from multidrop.control import eeprom_ledger
+from multidrop.control.eeprom_ledger import Ledger, LedgerCell, default_ledger_path
 from multidrop.control.ramp import start_staggered
-from multidrop.control.records import (
-    Ledger,
-    LedgerCell,
-    default_ledger_path,
-    noted_first,
-    read_audit,
-    written_by,
-)
+from multidrop.control.records import noted_first, read_audit, written_by
 from multidrop.core import Completion, Exchange
 from multidrop.core.process import flush_log
 from multidrop.drive import Condition, Drive
@@ -196,7 +190,7 @@ def test_eeprom_writes_are_refused_for_a_user_without_a_home_directory(
     monkeypatch.delenv("XDG_STATE_HOME", raising=False)
     monkeypatch.setattr(Path, "home", home)
     # root could create the default path
-    monkeypatch.setattr(records, "NO_HOME", Path("/dev/null"), raising=False)
+    monkeypatch.setattr(eeprom_ledger, "NO_HOME", Path("/dev/null"), raising=False)
     toy = simulated(Toy(1))
     toy["status"] = Status(0)
     line = SimulatedBus(toy)

@@ -15,8 +15,8 @@ from toy import Toy
 
 from multidrop.bus import Bus
 from multidrop.control import records
+from multidrop.control.eeprom_ledger import Ledger
 from multidrop.control.outcome import Effect
-from multidrop.control.records import Ledger
 from multidrop.core import Completion, Exchange, Failure, Message
 from multidrop.drive import Condition, Direction, Drive, Script, read, wait, write
 from multidrop.drive.register import COIL, Kept, reading, setting

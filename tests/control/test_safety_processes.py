@@ -19,8 +19,9 @@ from simulated_bus import SimulatedBus, is_write, one
 from tables import table, usually
 
 from multidrop.bus import Bus
+from multidrop.control.eeprom_ledger import BUDGET, YEAR, Ledger, LedgerCell
 from multidrop.control.outcome import Effect
-from multidrop.control.records import BUDGET, YEAR, AuditLog, Ledger, LedgerCell, read_audit
+from multidrop.control.records import AuditLog, read_audit
 from multidrop.core import Message, build_request
 from multidrop.drive import Drive
 from multidrop.errors import NoReply, Unconfirmed
@@ -106,7 +107,7 @@ CELL = LedgerCell("/dev/ttyUSB0", 1, "delixi-modbus", "frequency")
 # The program pauses: without pauses, one of the two processes could hold SQLite's lock for too long.
 ENTRANT = """
 import sys, time
-from multidrop.control.records import LedgerCell, Ledger
+from multidrop.control.eeprom_ledger import LedgerCell, Ledger
 ledger = Ledger(sys.argv[1], budget=30)
 cell = LedgerCell("/dev/ttyUSB0", 1, "delixi-modbus", "frequency")
 entered = 0

@@ -25,10 +25,11 @@ from simulated_bus import SimulatedBus, che_drives, is_write, one
 from tables import first_in_ci, in_turn, table, usually
 
 import multidrop
-from multidrop.control import ramp, records, stops
+from multidrop.control import eeprom_ledger, ramp, stops
+from multidrop.control.eeprom_ledger import Ledger
 from multidrop.control.outcome import Seen
 from multidrop.control.ramp import start_staggered
-from multidrop.control.records import Ledger, WriteRecords
+from multidrop.control.records import WriteRecords
 from multidrop.control.stops import LEAST_S, StopAttempt, stop_together
 from multidrop.core import Completion, Exchange
 from multidrop.core.process import flush_log
@@ -303,7 +304,7 @@ def test_a_repeated_stop_opens_a_locked_eeprom_ledger_only_once(
 
     line.loses = is_write
     with monkeypatch.context() as held:
-        held.setattr(records, "sqlite3", SimpleNamespace(connect=busy, Error=sqlite3.Error))
+        held.setattr(eeprom_ledger, "sqlite3", SimpleNamespace(connect=busy, Error=sqlite3.Error))
         line.bus.stop_all()
         line.bus._records.flush(60)
     flush_log(60)

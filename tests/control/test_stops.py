@@ -30,9 +30,9 @@ from simulated_bus import (
 )
 
 from multidrop.control.commands import stop_drive
+from multidrop.control.eeprom_ledger import Ledger
 from multidrop.control.outcome import UNSEEN, Seen
 from multidrop.control.ramp import ramp, start_staggered
-from multidrop.control.records import Ledger
 from multidrop.control.stops import AT_ONCE, LEAST_S, PAUSE_S
 from multidrop.core import Completion, Exchange, Message
 from multidrop.core.process import flush_log

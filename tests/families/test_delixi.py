@@ -9,7 +9,7 @@ from scripts import DELIXI_MONITORS, Wire, frame, rows, typed
 from simulated_bus import one
 from tables import table
 
-from multidrop.control.records import Ledger
+from multidrop.control.eeprom_ledger import Ledger
 from multidrop.drive import Condition, Direction, Framing, NotVerified, State, Unconfirmed, WriteForbidden
 from multidrop.drive.register import HOLDING, Carrier, Kept, setting
 from multidrop.errors import NoReply

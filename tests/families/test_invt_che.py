@@ -10,7 +10,7 @@ from scripts import Wire, frame, rows, typed
 from simulated_bus import one
 from tables import table
 
-from multidrop.control.records import Ledger
+from multidrop.control.eeprom_ledger import Ledger
 from multidrop.core import NumberFormat
 from multidrop.drive import (
     Condition,

@@ -26,7 +26,7 @@ from terminals import on_terminal
 
 from multidrop.cli.fleet import demo
 from multidrop.cli.fleet.demo import Stage, plant_file
-from multidrop.control import records
+from multidrop.control import eeprom_ledger
 from multidrop.plant.loader import load_plant
 
 
@@ -83,7 +83,7 @@ def test_a_stop_is_sent_for_a_user_without_a_home_folder(
 
     monkeypatch.delenv("XDG_STATE_HOME")
     monkeypatch.setattr(Path, "home", none)
-    monkeypatch.setattr(records, "NO_HOME", Path("/dev/null"))  # not even root can create this path
+    monkeypatch.setattr(eeprom_ledger, "NO_HOME", Path("/dev/null"))  # not even root can create this path
     status, out, err = run("fleet", *words, "--nats", nobody)
     assert (status, out) == (1, "")
     assert f"no NATS server answers at {nobody}: Connection refused" in err

@@ -44,6 +44,7 @@ FILES_TOUCHING_THE_SYSTEM = {
     "whole_file.py",
     "core/process.py",
     "core/port.py",
+    "control/eeprom_ledger.py",
     "control/records.py",
     "control/exit_hook.py",
     "control/call.py",

@@ -16,7 +16,7 @@ from multidrop.cli.support.arguments import add_json_argument, whole
 from multidrop.cli.support.files import refuse_overwriting, write_new
 from multidrop.cli.support.output import print_json, print_text, warn
 from multidrop.cli.support.values import counted, wrapped
-from multidrop.control.records import BUDGET, LEAST_INTERVAL
+from multidrop.control.eeprom_ledger import BUDGET, LEAST_INTERVAL
 from multidrop.control.rules import wears
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Access, Kept, Register

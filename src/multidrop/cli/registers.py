@@ -17,7 +17,7 @@ from multidrop.cli.support.arguments import (
 )
 from multidrop.cli.support.output import confirm, print_json, print_text, reporting_interruption
 from multidrop.cli.support.values import Row, aligned, as_json, as_row, nearest_value, user_title
-from multidrop.control.records import BUDGET, CYCLES, Ledger, Wear, default_ledger_path
+from multidrop.control.eeprom_ledger import BUDGET, CYCLES, Ledger, Wear, default_ledger_path
 from multidrop.control.rules import check_plain, raw_count, refused
 from multidrop.core import Status, utc_minus_monotonic_ns
 from multidrop.drive.family import Drive

@@ -5,6 +5,7 @@ asyncio.
 """
 
 from multidrop.control.call import written_before as written_before
+from multidrop.control.eeprom_ledger import Ledger as Ledger
 from multidrop.control.outcome import Effect as Effect
 from multidrop.control.outcome import Outcome as Outcome
 from multidrop.control.outcome import Seen as Seen
@@ -12,7 +13,6 @@ from multidrop.control.outcome import result_of_failure as result_of_failure
 from multidrop.control.outcome import with_name as with_name
 from multidrop.control.ramp import start_staggered as start_staggered
 from multidrop.control.records import AuditLog as AuditLog
-from multidrop.control.records import Ledger as Ledger
 from multidrop.control.records import noted_first as noted_first
 from multidrop.control.records import read_audit as read_audit
 from multidrop.control.records import written_by as written_by

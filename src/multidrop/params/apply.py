@@ -13,8 +13,8 @@ from hashlib import sha256
 from typing import Any, NamedTuple
 
 from multidrop.control.call import Call
+from multidrop.control.eeprom_ledger import Ledger
 from multidrop.control.outcome import Effect, Outcome
-from multidrop.control.records import Ledger
 from multidrop.control.records import commissioning as commissioning_block
 from multidrop.control.rules import check_plain, raw_count
 from multidrop.drive.family import Drive

@@ -11,7 +11,8 @@ from pathlib import Path
 from queue import SimpleQueue
 
 from multidrop.bus import Bus
-from multidrop.control.records import AuditLog, Ledger
+from multidrop.control.eeprom_ledger import Ledger
+from multidrop.control.records import AuditLog
 from multidrop.core import Mastership, RowQueue
 from multidrop.drive.family import Drive
 from multidrop.plant.model import PlantLine

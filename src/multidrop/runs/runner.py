@@ -18,10 +18,10 @@ from typing import Any, ClassVar
 
 from multidrop.bus import Bus
 from multidrop.control.call import written_before
+from multidrop.control.eeprom_ledger import Ledger
 from multidrop.control.exit_hook import await_signal
 from multidrop.control.outcome import Seen, Stopped
 from multidrop.control.ramp import check_setpoint, checked_rate, ramp
-from multidrop.control.records import Ledger
 from multidrop.drive.family import Drive
 from multidrop.errors import BadReply, BusError, Expired, NoReply
 from multidrop.plant.model import Plant, Polled, PolledDrive

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from multidrop.control.records import default_ledger_path
+from multidrop.control.eeprom_ledger import default_ledger_path
 from multidrop.core import Framing, build_reply, get_settings, set_settings
 from multidrop.drive.line_settings import Settings
 from multidrop.sim.drive import SimulatedDrive

@@ -14,7 +14,7 @@ from simulated_bus import SimulatedBus
 from tables import table
 
 from multidrop import Bus, Drive, Plant, WriteForbidden, load_family
-from multidrop.control.records import Ledger
+from multidrop.control.eeprom_ledger import Ledger
 from multidrop.families.registry import find_model
 from multidrop.planning.blocks import blocks
 from multidrop.recording import open_recording

@@ -20,7 +20,7 @@ from gateways import Served, served, written
 from lines import line, plant, polled, until
 
 from multidrop import LineError, NoReply, WriteForbidden
-from multidrop.control.records import LedgerCell
+from multidrop.control.eeprom_ledger import LedgerCell
 from multidrop.core import Counters, Status
 from multidrop.drive import parameters
 from multidrop.drive.parameters import ParameterGroup, ParameterSpace

@@ -27,7 +27,7 @@ sys.path.append(str(Path(__file__).parents[1] / "simulated"))
 from patient import await_turns
 
 from multidrop import Bus, BusError, DelixiNative, params
-from multidrop.control.records import Ledger
+from multidrop.control.eeprom_ledger import Ledger
 from multidrop.core import NumberFormat
 from multidrop.drive import Drive, Framing
 from multidrop.drive.register import HOLDING, reading, setting

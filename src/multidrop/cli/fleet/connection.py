@@ -13,7 +13,7 @@ from multidrop.cli.support.arguments import add_json_argument
 from multidrop.cli.support.files import require_extra
 from multidrop.cli.support.output import logging_to, warn
 from multidrop.cli.support.signals import run_loop
-from multidrop.control.records import default_ledger_path
+from multidrop.control.eeprom_ledger import default_ledger_path
 from multidrop.printable import masked
 
 if TYPE_CHECKING:
