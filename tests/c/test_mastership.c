@@ -14,10 +14,10 @@ static ssize_t noted_write(int fd, const void *bytes, size_t len);
 #define clock_gettime told_clock
 #define timer_create made_timer
 #define write noted_write
-#include "system/mastership.c"
+#include "mastership.c"
 #undef timer_create
 #undef clock_gettime
-#include "system/rs485.c"
+#include "rs485.c"
 #undef write
 #define send send_request /* the included file's static send() would clash with the system's */
 #include "port.c"

@@ -1,6 +1,6 @@
 /* Realtime scheduling returns to normal if a thread uses too much of a processor, and a thread that hangs
  * ends the process. */
-#include "system/realtime.c"
+#include "realtime.c"
 
 #include <assert.h>
 #include <stdio.h>

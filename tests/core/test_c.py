@@ -17,7 +17,7 @@ WAITS_BY_EPOLL = pytest.mark.skipif(sys.platform != "linux", reason="others wait
 def core_without(*replaced: str) -> list[str]:
     """Return the names of the core's C files, without those that the test program replaces."""
     csrc = ROOT / "csrc"
-    files = [*csrc.glob("*.c"), *csrc.glob("system/*.c")]
+    files = [*csrc.glob("*.c"), *csrc.glob("posix/*.c")]
     return [str(path.relative_to(csrc).with_suffix("")) for path in files if path.stem not in replaced]
 
 
@@ -79,7 +79,7 @@ def test_a_port_is_read_once_if_reply_delays_are_constant(build: Callable[..., N
 
 @pytest.mark.skipif(sys.platform != "linux", reason="others have no RS-485 mode")
 def test_rs485_transceiver_keeps_sending_until_the_last_bit(build: Callable[..., None]) -> None:
-    build("test_rs485", "system/rs485")
+    build("test_rs485", "rs485")
 
 
 @pytest.mark.slow
@@ -90,13 +90,13 @@ def test_a_command_that_waits_too_long_for_rts_is_cancelled(build: Callable[...,
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the driver is Linux's")
 def test_a_baud_rate_without_an_integer_divisor_is_refused(build: Callable[..., None]) -> None:
-    build("test_divisors", "system/serial")
+    build("test_divisors", "posix/serial")
 
 
 @WAITS_BY_EPOLL
 @pytest.mark.parametrize("program", ["test_waiter", "test_waiter_refused"])
 def test_waits_are_exact_to_the_nanosecond(build: Callable[..., None], program: str) -> None:
-    build(program, "system/waiter")
+    build(program, "posix/waiter")
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="masterships are Linux's")
@@ -108,4 +108,4 @@ def test_the_mastership_deadline_is_checked_before_each_write(build: Callable[..
 def test_realtime_scheduling_ends_if_a_thread_uses_too_much_processor_time(
     build: Callable[..., None],
 ) -> None:
-    build("test_realtime", "system/clock")
+    build("test_realtime", "clock")

@@ -272,7 +272,7 @@ WHOLE = Terms(lease=2, guard=2)
 
 
 def killed_at(until: int, terms: Terms) -> int:
-    """Return when the kernel kills a lease's holder that keeps its lines open (csrc/system/mastership.c)."""
+    """Return when the kernel kills a lease's holder that keeps its lines open (csrc/mastership.c)."""
     return until + terms.guard // 2
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
-NEEDING_A_SYSTEM = {"api", "engine", "port", "row_queue", "turn"}
+NEEDING_A_SYSTEM = {"api", "engine", "mastership", "port", "realtime", "row_queue", "rs485", "turn"}
 OPTIONS = ("-std=c11", "-D_DEFAULT_SOURCE", "-g", "-O1", f"-I{ROOT / 'csrc'}")
 
 
@@ -30,9 +30,7 @@ def compiled(folder: Path, *compiler: str) -> list[Path]:
 
 
 def _core() -> list[Path]:
-    csrc = ROOT / "csrc"
-    pure = [path for path in sorted(csrc.glob("*.c")) if path.stem not in NEEDING_A_SYSTEM]
-    return [*pure, csrc / "system" / "clock.c"]
+    return [path for path in sorted((ROOT / "csrc").glob("*.c")) if path.stem not in NEEDING_A_SYSTEM]
 
 
 # ---- corpora ----

@@ -274,7 +274,7 @@ def calls(code: dict[str, str]) -> dict[str, set[str]]:
 
 def core() -> dict[str, str]:
     """Return the text of each C file of the core by name, without comments."""
-    found = [*(ROOT / "csrc").glob("*.c"), *(ROOT / "csrc" / "system").glob("*.c")]
+    found = [*(ROOT / "csrc").glob("*.c"), *(ROOT / "csrc" / "posix").glob("*.c")]
     return {path.stem: re.sub(r"/\*.*?\*/", "", path.read_text("utf-8"), flags=re.DOTALL) for path in found}
 
 
@@ -364,7 +364,7 @@ def test_every_file_has_a_row_on_the_architecture_page() -> None:
     rows = [line.split("|")[1] for line in ARCHITECTURE.read_text("utf-8").splitlines() if line[:1] == "|"]
     named = {name.rstrip("/") for row in rows for name in re.findall(r"`([^`]+)`", row)}
     csrc = ROOT / "csrc"
-    places = [*PACKAGE.iterdir(), *csrc.glob("*.c"), *csrc.glob("system/*.c"), csrc / "windows"]
+    places = [*PACKAGE.iterdir(), *csrc.glob("*.c"), *csrc.glob("posix/*.c"), csrc / "windows"]
     packages = {path.name for path in places if path.name[0] != "_" and path.suffix in ("", ".py", ".c")}
     assert {package for package in packages if not any(fnmatch(package, name) for name in named)} == set()
 
