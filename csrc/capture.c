@@ -135,7 +135,7 @@ int md_unpack(struct md_capture *capture)
 
 enum { MOST_NOISE = 3 }; /* limit of noise bytes between request and reply; more may be a damaged request */
 
-/* Return the index of the first byte after the next pause; the stream's length if there is no later pause. */
+/* Return the index of the first byte after the next pause; the stream's length if no pause follows. */
 static size_t end_of_run(const struct md_stream *stream, size_t piece)
 {
     while (++piece < stream->count)

@@ -60,7 +60,7 @@ def plain_number(text: str) -> float:
 
 
 def is_number(value: object) -> TypeGuard[float]:
-    """Return True for an int or a float. True and False are no numbers here, although bool is an int."""
+    """Return True for an int or a float. True and False do not count as numbers, although bool is an int."""
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 

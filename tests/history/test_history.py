@@ -294,7 +294,7 @@ def test_other_segments_are_read_if_one_is_damaged(tmp_path: Path) -> None:
 def test_an_incomplete_end_of_a_closed_segment_is_reported(tmp_path: Path) -> None:
     rows = [random_rows(number, NOON + number * 60 * SECOND, 120) for number in range(2)]
     record(tmp_path, rows)
-    # Segment 2 is the newest one. Its incomplete end is no damage, because a recorder may still write to it.
+    # Segment 2 is the newest one. Its incomplete end is not damage, because a recorder may still write to it.
     for number in (2, 1):
         path = tmp_path / f"rows.0000000{number}.arrows"
         path.write_bytes(path.read_bytes() + b"\0" * 7)

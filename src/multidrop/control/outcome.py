@@ -77,7 +77,7 @@ class Seen(Enum):
     NO_MOTOR = "has no motor"  # no stop was needed
 
 
-# the reason in the result of a stop whose script reads nothing after its last write
+# the reason in the result of a stop whose script has no read after its last write
 UNSEEN = "confirmed, but not seen to stand"
 
 
@@ -118,7 +118,7 @@ _OUTCOMES: tuple[tuple[type[BaseException], CommandOutcome], ...] = (
     (CancelledByStop, CommandOutcome.NOT_SENT),
     (DriveException, CommandOutcome.FAILED),
     (NotVerified, CommandOutcome.FAILED),
-    # raised only by a read before the first write, so nothing was written
+    # raised only by a read before the first write, so no write was sent
     (NoReply, CommandOutcome.NOT_SENT),
     (BadReply, CommandOutcome.NOT_SENT),
 )

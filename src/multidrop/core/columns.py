@@ -187,7 +187,7 @@ def _packed(extra: Extra) -> dict[str, Any]:
 
 
 class RowLayout:
-    """The fields in the reply to one request. `drive` is the number that stands for the drive's name."""
+    """The fields in the reply to one request. `drive` is the number (code) of the drive's name."""
 
     def __init__(self, drive: int, fields: Sequence[Field]) -> None:
         self._fields, self._extra = _shared(tuple(fields))
@@ -281,7 +281,7 @@ class Spelling(NamedTuple):
 
 
 class Names:
-    """Names, and the numbers (codes) that stand for them in columns. A name is never removed."""
+    """Names, and their numbers (codes) in columns. A name is never removed."""
 
     def __init__(self, names: Iterable[str] = ()) -> None:
         self._names = list(names)

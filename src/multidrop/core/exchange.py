@@ -347,7 +347,7 @@ class Completion:
 
     @property
     def data(self) -> bytes:
-        """The data of the good reply; empty if there is no good reply."""
+        """The data of the good reply; empty without a good reply."""
         reply = self.c.reply
         return bytes(ffi.buffer(reply.data, reply.data_len)) if self.count >= 0 else b""
 

@@ -428,7 +428,7 @@ E = TypeVar("E", bound=IntEnum | IntFlag)
 class Details(TypedDict, total=False):
     """Optional attributes of a declared register, besides its address and unit."""
 
-    step: float | None  #: quantity that one raw count stands for; None if the document does not state it
+    step: float | None  #: quantity per raw count; None if the document does not state it
     offset: float  #: value of the raw count 0, so that value = raw count * step + offset
     #: Raw counts that mean "no value". A bit pattern is also accepted, such as 0x8000 for an I16.
     invalid: float | tuple[float, ...]

@@ -29,7 +29,7 @@ from multidrop.transport import LineStatistics
 # limits of one read from the stream: number of messages, and their size in bytes
 MOST_READ, MOST_READ_BYTES = 64, 8 << 20
 MOST_BATCHES = 100  # limit of batches of samples that wait for the gateway; the oldest are dropped
-PAUSE_S = 0.2  # pause before the next read from the stream if there was no new message
+PAUSE_S = 0.2  # pause after a read from the stream without a new message
 AGAIN_S = 1.0  # pause after a failure, and between two checks of the fleet's lines
 SILENT_S = 6.0  # a line counts as lost after this many seconds without a sample
 MOST_NAMES = 65_535  # limit of different drive names, and of register names: their codes have 16 bits
@@ -103,7 +103,7 @@ class RowReader:
         self.arrivals: dict[str, tuple[int, int]] = {}
 
     def rows(self, messages: Sequence[StreamMessage]) -> FollowedRows | None:
-        """Return the newest sample of each register in these messages; None if there is no new sample.
+        """Return the newest sample of each register in the messages; None if no sample is new.
 
         Skip a sample that is older than a returned sample of the same register: a gateway may send samples of
         a line long after another gateway has taken the line over.

@@ -446,7 +446,7 @@ def _digest(paths: Iterable[Path]) -> str:
 
 
 def _check_audit(path: Path) -> None:
-    """Raise ValueError if the audit log cannot be written. A hanging disk is no error."""
+    """Raise ValueError if the audit log cannot be written. A hanging disk is not an error."""
     with suppress(Hung):
         in_time("audit log", AUDIT_S, partial(check_writable, path))
 

@@ -515,7 +515,7 @@ def _scale(register: ImportedRegister, cells: Cells, *, is_neuron: bool) -> None
 
 
 def _step(register: ImportedRegister, key: str, given: str, *, is_neuron: bool) -> float:
-    """Return the value that one raw count stands for. Raises ValueError unless the cell is a number."""
+    """Return the value of one raw count. Raises ValueError unless the cell is a number."""
     amount = number(given, 1)
     exact = Fraction(str(amount))
     if amount == 0 and key != "decimal":

@@ -133,7 +133,7 @@ def float_of_bits(bits: int, number: str) -> float | str:
 
 
 MOST_CHARACTERS = 1_000_000
-MOST_NODES = 50_000  # limit of nodes; an alias counts as many nodes as it stands for
+MOST_NODES = 50_000  # limit of nodes; an alias counts as many nodes as it expands to
 
 
 class YamlTag(str):
@@ -171,7 +171,7 @@ def parse_yaml(text: str) -> Any:
             return node
 
         def count_again(self, node: Any) -> None:
-            """Count the nodes that an alias stands for, up to the limit."""
+            """Count the nodes that an alias expands to, up to the limit."""
             pending = [node]
             while pending and self.left >= 0:
                 self.left -= 1

@@ -72,7 +72,7 @@ def plan(
     also: Collection[str] = (),
     progress: Progress | None = None,
 ) -> ApplyPlan:
-    """Return the writes that `apply` would make. Reads from the drive, but writes nothing.
+    """Return the writes that `apply` would make. Reads from the drive, but does not write.
 
     `also` lists codes of communication parameters (address, baud rate) to write as well; by default these are
     left out. Raises WriteForbidden if the motor runs or the drive is of another family. Raises ValueError for

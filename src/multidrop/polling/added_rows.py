@@ -154,7 +154,7 @@ class AddedRows:
         return bool(self._channels or self._events)
 
     def added_to(self, batch: Batch | None) -> Batch | None:
-        """Return the batch with the rows of channels and events appended; None if there is no row at all."""
+        """Return the batch with the rows of channels and events appended; None if the result has no rows."""
         with self._lock:
             added, self._events = self._events, []
             if batch is not None and self._channels:

@@ -336,7 +336,7 @@ class Rows(ArrowTable):
 
 
 class Batch(Rows):
-    """Rows from the core, with the names that the codes in the rows stand for."""
+    """Rows from the core, with the names for the codes in the rows."""
 
     def __init__(self, columns: Columns, drives: Names, registers: Names) -> None:
         self._columns = columns
@@ -356,7 +356,7 @@ class Batch(Rows):
             yield Row(time, sent, sample[0], drives[drive], registers[register], sample[1], _STATUSES[status])
 
     def columns(self) -> BatchColumns:
-        """Return the columns, without a copy, and the names that their codes stand for.
+        """Return the columns, without a copy, and the names for their codes.
 
         For many rows this is much faster than one `Row` object for each.
         """

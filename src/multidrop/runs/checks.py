@@ -53,7 +53,7 @@ def check_step(step: RunStep, plant: Plant) -> None:
 
 
 def _rehearse(script: Any, *arguments: Any) -> Any:
-    """Return the first step of a command's script, such as a write; nothing is sent.
+    """Return the first step of a command's script, such as a write, without sending it.
 
     Raises ValueError if the drive does not have this command, or if it may not be sent.
     """

@@ -208,7 +208,7 @@ def test_a_reverse_start_turns_the_motor_backward_or_is_refused(line: Line, mode
     line.bus.sleep(2)
     assert line.drive.state().condition is Condition.RUNNING
     assert line.sim.motor.frequency == pytest.approx(-20, abs=0.01)
-    if model in ("danfoss-fc51", "schneider-atv320"):  # the status of these drives shows no direction
+    if model in ("danfoss-fc51", "schneider-atv320"):  # the status of both models shows no direction
         with pytest.raises(WriteForbidden, match="cannot report its direction"):
             line.drive.start()
     else:
@@ -363,7 +363,7 @@ def test_an_optidrive_with_swapped_status_bytes_cannot_be_started() -> None:
     assert line.starts == []
 
 
-# Register values that show another make. One value is no proof: a drive of the declared make may also have
+# Register values that show another make. One value is not proof: a drive of the declared make may also have
 # it, for example before a restart.
 OF_ANOTHER = {
     "status": 0x0241,  # this status does not exist in PROFIdrive
@@ -375,7 +375,7 @@ OF_ANOTHER = {
 @table("first", OF_ANOTHER)
 @table("second", OF_ANOTHER)
 def test_a_stop_is_refused_only_if_two_registers_show_another_family(first: str, second: str) -> None:
-    """One make's stop word may run another make's motor. One value, or two settings, prove nothing."""
+    """One make's stop word may run another make's motor. One value, or two settings, are not proof."""
     line = Line("abb-acs355")
     shown = {line.drive.register(name).address: OF_ANOTHER[name] for name in (first, second)}
 

@@ -130,7 +130,7 @@ def text(cell: str) -> str:
 
 
 def number(cell: str) -> int | float:
-    """Parse a decimal or hex number. Raises ValueError with a valid example if the text is no such number."""
+    """Parse a decimal or hex number. Raises ValueError with a valid example for any other text."""
     if match := _HEX_COUNT.fullmatch(cell):
         return int(match[1] or match[2], 16)
     if _WHOLE.fullmatch(cell) and len(cell) <= 20:

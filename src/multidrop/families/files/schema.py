@@ -401,7 +401,7 @@ def _register() -> dict[str, Any]:
 
 
 def _of_access(access: Access) -> dict[str, Any]:
-    """Return the schema of a register in one section; `access` stands for it, as READING for [reading]."""
+    """Return the schema of a register in one section; `access` names it, as READING for [reading]."""
     if access is Access.READING:
         never_written = {key: {"maxItems": 0} for key in _NEVER_WRITTEN}
         only: dict[str, Any] = {"properties": {**never_written, "moves": {"const": False}}}

@@ -222,7 +222,7 @@ class Profile(Drive):
     refused in a fault, in local control, without a setpoint in force, and while the status is impossible in
     this profile. A reset is refused while the motor turns, never has a bit that runs it, and comes after a
     stop. `identify` only reads. A stop is refused only if the status is impossible in this profile and
-    neither 0 nor FFFFH, and another check fails too. A wrong `station` or `signature` alone is no proof of
+    neither 0 nor FFFFH, and another check fails too. A wrong `station` or `signature` alone does not prove
     another family: these are settings, and may not be in force yet.
     """
 
