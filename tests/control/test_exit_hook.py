@@ -343,7 +343,7 @@ def test_a_bus_made_on_a_thread_warns_if_the_program_replaced_a_signal_handler(
     thread.join(PATIENCE)
     assert (
         caplog.text.count(
-            "SIGTERM no longer stops the drives, because the program set its own signal handler"
+            "SIGTERM will not stop the drives, because the program has set its own signal handler"
         )
         == 1
     )

@@ -30,8 +30,9 @@ PACKAGE = __name__.partition(".")[0]
 MOST_NAMES = 20  # limit of the drives that a message names
 CUT_SHORT = "the stops were cut short by a third signal: motors may still be turning"
 REPLACED = (
-    "%s no longer stops the drives, because the program set its own signal handler; closing the bus or "
-    "ending the process still stops them. For a new handler, open a bus with stop_on_exit in the main thread"
+    "%s will not stop the drives, because the program has set its own signal handler; closing the bus or "
+    "ending the process still stops them. To handle the signal again, open a bus with stop_on_exit in the "
+    "main thread"
 )
 STOPPING = "{} received: stopping {}; press Ctrl-C three times within a second to give up"
 

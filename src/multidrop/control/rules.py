@@ -88,7 +88,7 @@ def _has(drive: Drive, name: str) -> bool:
 
 
 def check_broadcast(drive: Drive, register: Register[Any], raw: float) -> None:
-    """Raise WriteForbidden if a drive lacks the option `confirmed` that this write needs. Stops never do."""
+    """Raise WriteForbidden if the drive needs the option `confirmed` and lacks it. A stop never needs it."""
     if not is_stop(drive, register, raw):
         drive.check_confirmed(register.name)
 

@@ -363,7 +363,7 @@ class InnovertIBD(Drive):
         yield from insist(self.control, IBDControl.STOP)
         limit = (yield from read(self.deceleration_time)) + STOP_MARGIN
         look = self._is_at_rest
-        with suppress(BusError):
+        with suppress(BusError):  # a lost reply does not end the stop: current and speed are read instead
             if not self._has_state and (yield from self._programmed()):
                 look = self._is_off
         yield from self._stopped(look, limit)
