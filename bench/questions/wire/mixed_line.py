@@ -17,7 +17,7 @@ from bench.masters import many_adapter
 from bench.support import tables
 from bench.support.programs import CORE, FRAMES, compiled, module, talking
 
-PORT = str(CORE / "system" / "serial.c")
+PORT = str(CORE / "posix" / "serial.c")
 
 
 def measured(line: many_adapter.Mixed, seconds: float) -> tuple[dict[str, Any], dict[str, Any]]:
