@@ -32,9 +32,8 @@ int md_columns_add(struct md_columns *columns, const struct md_block *block,
                    const struct md_completion *completion, int64_t utc_minus_monotonic_ns);
 /* Return the number of the block's fields that have no value in a good reply. */
 uint64_t md_count_lacking(const struct md_block *block, const struct md_message *reply);
-/* Keep the queue in memory until md_row_queue_release(), even if its client frees it. */
+/* Keep the queue in memory until one more call of md_row_queue_release(). */
 void md_row_queue_hold(struct md_row_queue *row_queue);
-void md_row_queue_release(struct md_row_queue *row_queue);
 /* Append the exchange's rows to the newest chunk; do nothing if `block` is NULL. */
 void md_row_queue_add(struct md_row_queue *row_queue, const struct md_block *block,
                       const struct md_completion *completion);

@@ -101,12 +101,6 @@ void md_row_queue_release(struct md_row_queue *queue)
         destroy(queue);
 }
 
-/* A chunk or a port may outlive its queue: a garbage collector frees them in any order. */
-void md_row_queue_free(struct md_row_queue *queue)
-{
-    md_row_queue_release(queue);
-}
-
 /* ---- rows ---- */
 
 static struct md_columns *newest(struct md_row_queue *queue)

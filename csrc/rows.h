@@ -115,8 +115,9 @@ size_t md_find_codes(const uint16_t *drives, const uint16_t *registers, size_t n
 /* Return a queue of up to `most_chunks` chunks of rows. While all chunks are full, new rows are dropped and
  * counted. */
 struct md_row_queue *md_row_queue_new(size_t chunk_rows, size_t most_chunks);
-/* Free the queue as soon as no port reports to it and all taken chunks are given back. */
-void md_row_queue_free(struct md_row_queue *row_queue);
+/* Free the queue as soon as no port reports to it and all taken chunks are given back. A garbage collector
+ * releases them in any order. */
+void md_row_queue_release(struct md_row_queue *row_queue);
 /* Add rows for values that were due at `due_ns` but not requested. */
 void md_row_queue_miss(struct md_row_queue *row_queue, const struct md_block *block, int status,
                        int64_t due_ns);

@@ -120,6 +120,6 @@ int main(void)
         pthread_join(clients[i], NULL);
     __atomic_store_n(&is_over, 1, __ATOMIC_SEQ_CST);
     pthread_join(taker, NULL);
-    md_row_queue_free(row_queue);
+    md_row_queue_release(row_queue);
     return 0;
 }

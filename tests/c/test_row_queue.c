@@ -39,6 +39,6 @@ int main(void)
     for (int n = 0; n < ROWS; n++)
         assert(columns->time[n] - columns->sent[n] == (n <= ROWS / 2 ? 1000 : 7000));
     md_row_queue_give_back(row_queue, columns);
-    md_row_queue_free(row_queue);
+    md_row_queue_release(row_queue);
     return 0;
 }

@@ -41,7 +41,7 @@ class RowQueue:
         made = lib.md_row_queue_new(*self._room)
         if made == ffi.NULL:
             raise OSError(ffi.errno, "no memory for the rows of a poll")
-        self.c = ffi.gc(made, only_here(lib.md_row_queue_free))
+        self.c = ffi.gc(made, only_here(lib.md_row_queue_release))
         self._give_back = only_here(partial(lib.md_row_queue_give_back, self.c))
 
     def forked(self) -> None:
