@@ -86,7 +86,7 @@ def pytest_itemcollected(item: pytest.Item) -> None:
 
 @pytest.hookimpl(trylast=True)  # runs after deselected tests were removed
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Distribute the slow tests, so that every worker starts with its share of them."""
+    """Distribute the slow tests, so that every worker starts with its share."""
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
     slow = [item for item in items if item.get_closest_marker("slow")]
     others = iter([item for item in items if not item.get_closest_marker("slow")])

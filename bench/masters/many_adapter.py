@@ -46,7 +46,7 @@ def _opened(port: str, *facts: Any) -> Line:
 
 @contextmanager
 def _polling_drives(lines: Mapping[str, Sequence[Drive]], every: float | None) -> Iterator[Poller]:
-    """Yield a poller of all registers of these drives; a port is a path, or the number of a descriptor."""
+    """Yield a poller of all registers of the drives; a port is a path, or the number of a descriptor."""
     declared = tuple(
         PlantLine(
             port,

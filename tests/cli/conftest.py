@@ -1,4 +1,4 @@
-"""Fixtures of simulated lines, and a plant file for one of them."""
+"""Fixtures of simulated lines, and a plant file for one line."""
 
 from __future__ import annotations
 

@@ -283,7 +283,7 @@ def frame(asked: bool, *message: Any, framing: Framing = Framing.RTU) -> tuple[b
 
 
 def told(run: Run, path: Path, frames: Iterable[tuple[bytes, Side]], *words: object) -> list[str]:
-    """Return what `decode` prints for a capture of these frames, 1 ms apart, without times of day."""
+    """Return what `decode` prints for a capture of the frames, 1 ms apart, without times of day."""
     with CaptureWriter(path) as writer:
         for number, (raw, side) in enumerate(frames):
             writer.write(raw, side, number * 1_000_000, "hall-1")

@@ -72,7 +72,7 @@ def row(drive: str, register: str, value: float | None, status: str = "ok", ago:
 
 
 def told(seconds: float, exchanges: int, utilisation: float, drives: int = 3) -> dict[str, LineStatistics]:
-    """Return statistics of a line of which only the first drive has exchanges."""
+    """Return statistics of a line with exchanges of the first drive only."""
     busy = Counters(
         sent=exchanges,
         ideal_ns=round(utilisation * seconds * SECOND),

@@ -249,7 +249,7 @@ def size(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 def drawings(tmp_path: Path, encoding: str, size: list[int], *widths: int) -> list[str]:
-    """Return what is drawn on a terminal of each of these widths in turn."""
+    """Return what is drawn on a terminal of each width in turn."""
     path = tmp_path / "plant.toml"
     drive = DRIVE.format(WIDE_NAME)
     path.write_text(f'[[line]]\nname = "hall"\nport = "x"\n{drive}poll = ["output_frequency"]\n', "utf-8")

@@ -64,7 +64,7 @@ tripped   reset_fault   ok   ok/?      ?    ?     ok/?    x         ?/ok ?      
 """
 SEVERAL_WORDS = {"abb-acs355", "siemens-v20", "schneider-atv320"}  # a start takes several control words
 SECOND: dict[tuple[str, str], set[str]] = {
-    # the setpoints of these drives cannot be read back
+    # drives whose setpoints cannot be read back
     ("set_frequency", "?"): {"innovert-ibd", "delixi-native", "danfoss-fc51", "delta-vfd-el"},
     # these drives read a limit or the present value before the write
     ("set_frequency", "-"): {"erman-er-g-220", "delixi-modbus", "yd1000"},

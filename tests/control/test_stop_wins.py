@@ -220,7 +220,7 @@ class Stops(RuleBasedStateMachine):
         second.join()
 
     def _is_deaf_to_signals(self) -> bool:
-        """Ignore SIGNALS from now on; return False if a signal arrived before all of them were ignored."""
+        """Ignore SIGNALS from now on; return False if a signal arrived before all SIGNALS were ignored."""
         try:
             for number in SIGNALS:
                 signal.signal(number, signal.SIG_IGN)

@@ -41,7 +41,7 @@ ALSO_ANSWER = bytes.fromhex("01 03 02 13 88 B5 12")  # another reply with the le
 
 
 def split(*pieces: bytes) -> list[FrameSpan]:
-    """Return the spans of these pieces of a stream; piece i is received at time i."""
+    """Return the spans of a stream's pieces; piece i is received at time i."""
     stream = Stream()
     for time, piece in enumerate(pieces):
         stream.put(piece, time)

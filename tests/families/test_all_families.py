@@ -341,7 +341,7 @@ def scripts_of(tree: ast.AST) -> set[str]:
 
 
 def forgotten(tree: ast.AST, scripts: set[str]) -> list[int]:
-    """Return the line numbers of calls that ignore the generator which one of these functions returns."""
+    """Return the line numbers of calls that ignore the generator which a function in `scripts` returns."""
     calls = [node.value for node in ast.walk(tree) if isinstance(node, ast.Expr)]
     found = []
     for call in calls:
@@ -368,7 +368,7 @@ def test_every_call_of_a_script_uses_yield_from() -> None:
         and isinstance(node.value.value, ast.Call)
     ]
     assert len(carried_out) > 80
-    # Each of these calls would be a mistake without `yield from`, and `forgotten` must then find it.
+    # Each call would be a mistake without `yield from`, and `forgotten` must then find it.
     for node in carried_out:
         call = node.value.value  # type: ignore[attr-defined]
         assert forgotten(ast.Module([ast.Expr(call)], []), scripts) == [call.lineno]

@@ -53,7 +53,7 @@ RUNS_AT_A_STOP = {
         *("delta-vfd-el", "delta-ms300", "delta-cp2000"),
     ),
 }
-# A drive of these built-in families is always recognised. It gets no stop if another family is declared.
+# Built-in families whose drives are always recognised. They get no stop if another family is declared.
 RECOGNISED = {"invt-che", "yd1000"}
 
 

@@ -72,7 +72,7 @@ static int is_read(const struct md_message *request)
     return request->function <= 0x04;
 }
 
-/* Check that at least one of these bytes is from the drive's reply to the present exchange. */
+/* Check that at least one byte of `raw` is from the drive's reply to the present exchange. */
 static void check_origin(const uint8_t *raw, size_t len)
 {
     int is_own = 0;
@@ -403,7 +403,7 @@ static size_t act(const uint8_t *step, size_t left)
     case NOISE_COMES:
         len = left < 2 ? 0 : step[1] < left - 2 ? step[1] : left - 2;
         for (size_t i = 0; i < len; i++)
-            scene.is_spoiled |= step[2 + i] < 0xF8; /* the noise may be a frame, or a part of it */
+            scene.is_spoiled |= step[2 + i] < 0xF8; /* the noise may be a frame, or a part of one */
         hear(step + 2, len, NOISE);
         if (len == 0 && scene.after + FLOOD < HEARD)
             hear(flood, FLOOD, NOISE);

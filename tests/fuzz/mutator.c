@@ -1,7 +1,7 @@
 /* The mutator of all C harnesses: mutate an input, then repair lengths, byte counts and checksums of frames.
  *
  * Otherwise a receiver would reject nearly all mutated frames at its first checks.
- * Sometimes it leaves one of these fields wrong, to test the handling of a frame with a single mistake. */
+ * Sometimes it leaves one field wrong, to test the handling of a frame with a single mistake. */
 #include "fuzz.h"
 
 enum { MOST_BODY = 260 }; /* slightly more than any frame's body */

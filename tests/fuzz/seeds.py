@@ -1,4 +1,4 @@
-"""Make the fuzzers' seeds: frames from the manuals, captures of these frames, and valid files.
+"""Make the fuzzers' seeds: frames from the manuals, captures of the frames, and valid files.
 
 python tests/fuzz/seeds.py DIRECTORY HARNESS...    write each harness's seeds to DIRECTORY/HARNESS-seeds
 """

@@ -59,7 +59,7 @@ def drive(tmp_path: Path) -> Iterator[Counting]:
 def falls_silent(drive: Counting) -> None:
     def has_ended() -> bool:
         before = drive.requests
-        sleep(0.02)  # enough time for several polls, each of which takes a millisecond
+        sleep(0.02)  # enough time for several polls of a millisecond each
         return drive.requests == before
 
     until(has_ended, 10.0)

@@ -1,4 +1,4 @@
-"""The supervisor of a gateway's permanent tasks and threads: if one of them ends, /health fails."""
+"""The supervisor of a gateway's permanent tasks and threads: if one ends, /health fails."""
 
 from __future__ import annotations
 

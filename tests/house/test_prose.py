@@ -71,7 +71,7 @@ def text_of(path: Path) -> str:
 
 
 def stumbles(paths: list[Path]) -> float:
-    """Return the hits of CONSTRUCTIONS per 1,000 words of these files' text."""
+    """Return the hits of CONSTRUCTIONS per 1,000 words of the files' text."""
     texts = [text_of(path) for path in paths]
     words = sum(len(re.findall(r"[A-Za-z']+", text)) for text in texts)
     return 1000 * sum(len(STUMBLES.findall(text)) for text in texts) / max(words, 1)

@@ -305,7 +305,7 @@ def test_no_other_plan_for_a_built_in_family_takes_less_time(data: st.DataObject
         forbidden = [range(low, high + 1) for low, high in zip(bounds[::2], bounds[1::2], strict=True)]
         asked = range(block.start, block.start + block.count)
         assert not any(at in part for at in asked for part in forbidden)
-        # the documents of these families only describe reads of one register
+        # the documents of Delixi and YD1000 only describe reads of one register
         if model.startswith(("delixi", "yd1000")):
             assert len(block.registers) == 1
 

@@ -49,7 +49,7 @@ class Two:
         )
 
     def until(self, *wanted: tuple[str, str]) -> None:
-        """Take new rows until each of these (drive, status) pairs has appeared."""
+        """Take new rows until each (drive, status) pair in `wanted` has appeared."""
         rows_of(self.poller)
         missing = set(wanted)
 

@@ -86,7 +86,7 @@ def test_a_line_is_checked_more_often_while_a_drive_is_silent(
 @pytest.mark.story
 @pytest.mark.parametrize(("dead", "back_s"), [(1, 5), (5, 25), (10, 45)])
 def test_silent_drives_hardly_slow_the_other_drives(dead: int, back_s: int) -> None:
-    """Once they answer again, all of them are polled within `back_s` seconds."""
+    """Once the silent drives answer again, all are polled within `back_s` seconds."""
     drives = [InvtCHE(address, name=f"drive-{address}", baudrate=38_400) for address in range(1, DRIVES + 1)]
     sims = [simulated(drive) for drive in drives]
     clocked = ClockedLines(

@@ -29,7 +29,7 @@ from multidrop.sim.memory import MemoryCell
 
 SEED = 6
 MOST_TOLD = 9  # largest number of reports for which the test waits before it kills a client
-LONGEST_WAIT = 0.03  # largest delay in s between the last of these reports and the kill
+LONGEST_WAIT = 0.03  # largest delay in s between the last report and the kill
 
 
 class Counting(SimulatedDrive):

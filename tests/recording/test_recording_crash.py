@@ -289,7 +289,7 @@ def test_recording_to_a_full_disk_raises_an_error(tmp_path: Path, suffix: str) -
 
 @growing
 def test_recording_continues_when_the_disk_has_room_again(tmp_path: Path, suffix: str) -> None:
-    """If a batch does not fit on the disk, no part of it remains between the batches before and after it."""
+    """If a batch does not fit on the disk, no part remains between the batches before and after it."""
     path = tmp_path / f"a{suffix}"
     with open_writer(path, METADATA) as writer:
         writer.write(counting(ROWS))

@@ -223,8 +223,8 @@ def test_line_utilisation_is_computed_from_a_recording(
     look = load(record(tmp_path / "it.arrows", turns, ABOUT | {"planned": planned}))
     (line,) = line_uses(look)
     # Pump: 14 ms from the request to the reply's first character, and 8 ms for the reply's other characters.
-    # Fan: 13 ms and 6 ms. Between two exchanges the line is silent: for 10 ms if one of them is with the fan,
-    # otherwise for 4 ms.
+    # Fan: 13 ms and 6 ms. Between two exchanges the line is silent: 10 ms if one exchange is with the fan,
+    # otherwise 4 ms.
     assert line.needed[1:99] == pytest.approx(np.array([0.029, 0.032] * 49))
     assert line.needed[101:] == pytest.approx(np.full(49, 0.026))
     assert line.utilisation == pytest.approx((50 * 0.029 + 50 * 0.032 + 50 * 0.026) / 9.976, rel=0.01)

@@ -130,7 +130,7 @@ ODD: list[Any] = [10**400, None, True, -1, 1e308, "", "x", [], [1], {}, {"a": {}
 
 
 def with_odd(about: Any, odd: Any) -> Iterator[Any]:
-    """Yield copies of the metadata, in each of which a different part is replaced by `odd`."""
+    """Yield copies of the metadata. In each copy, a different part is replaced by `odd`."""
     yield odd
     for key, part in about.items() if isinstance(about, dict) else enumerate(about) if about else ():
         if isinstance(part, dict | list):

@@ -158,14 +158,14 @@ def test_the_value_axis_includes_zero_if_the_values_are_near_it(tmp_path: Path) 
         assert low == bottom if bottom is not None else 0 < low < least
 
 
-STATUS = {  # metadata of status registers, as in the documents of these families
+STATUS = {  # metadata of status registers, as in the families' documents
     "erman": {"STOPPED": 0, "RUNNING": 1, "ACCELERATING": 2, "DECELERATING": 3},
     "che": {"FORWARD": 1, "REVERSE": 2, "STANDBY": 3, "FAULT": 4},
 }
 
 
 def states(path: Path, rows: list[Row]) -> Recording:
-    """Return a recording of three drives; `status` is an enumeration of two of them, and a set of bits."""
+    """Return a recording of three drives; `status` is an enumeration in two, and a set of bits in one."""
     meanings: dict[str, Any] = {
         name: {"unit": "", "values": names, "bits": False} for name, names in STATUS.items()
     }

@@ -136,7 +136,7 @@ def test_a_port_is_reopened_only_with_the_same_adapter(
         (("1-1", "A1"), ("1-2", "A1"), [("1-1", "B2")], False),
         (("1-1", ""), ("1-1", ""), [("1-2", "")], True),
         (("1-1", ""), ("1-2", ""), [], False),
-        # two adapters with the known serial number, but neither of them in the old USB socket
+        # two adapters with the known serial number, but neither is in the old USB socket
         (("1-1", "A1"), ("1-2", "A1"), [("1-3", "A1")], False),
     ],
 )

@@ -42,7 +42,7 @@ def load(folder: Path) -> tuple[list[ImportedDevice], list[str]]:
 
 
 class Coverage:
-    """Counts the registers of imported devices, and how many of them the library can represent."""
+    """Counts the registers of imported devices, and how many registers the library can represent."""
 
     def __init__(self, devices: Iterable[ImportedDevice]) -> None:
         self.by_device = [(device, holdings(device)) for device in devices]
@@ -64,7 +64,7 @@ class Coverage:
         return [entry for _, entries in self.by_device for entry in entries]
 
     def needed(self) -> Iterator[tuple[str, int, int]]:
-        """Yield each detail's title, the number of entries with it, and how many of these can be declared."""
+        """Yield each detail's title, the number of entries with it, and the number that can be declared."""
         for key, words in DETAILS.items():
             needing = [entry for entry in self.entries if key in entry.details]
             yield words, len(needing), sum(entry.is_whole for entry in needing)

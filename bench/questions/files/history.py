@@ -62,7 +62,7 @@ update recorded set status = 'no reply', uncertainty_ns = null where value is nu
 
 
 def made(database: Any, begin_s: int, end_s: int, every: int = 1) -> None:
-    """Fill the table `recorded` with rows of these seconds, at 10 Hz divided by `every`."""
+    """Fill the table `recorded` with rows from `begin_s` to `end_s`, at 10 Hz divided by `every`."""
     database.execute("drop table if exists recorded")
     database.execute(TABLE)
     insert, update = MADE.split(";")

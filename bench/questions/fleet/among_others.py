@@ -1,6 +1,6 @@
 """Does a gateway in a large fleet poll its lines at their configured rate, like a poller alone?
 
-A fleet of 20 gateways on three real NATS nodes has thousands of lines, all on this machine. Nineteen of these
+A fleet of 20 gateways on three real NATS nodes has thousands of lines, all on this machine. Nineteen
 gateways are only state machines, whose lines do not exist. The real gateway polls its share: some 500 lines
 on TCP sockets with one drive each. Before that, `multidrop poll` polls the same lines alone. Two CPU cores
 can poll 500 lines only at a modest rate: twice a second by default. The simulated drives measure the rates.

@@ -90,7 +90,7 @@ def case(name: str, port: str, wanted: Wanted, seconds: float) -> Case:
 def middle(times: Sequence[int]) -> float:
     """Return the usual interval in s between these times in ns.
 
-    Each second has a mean interval; the result is the median of these means.
+    Each second has a mean interval; the result is the median of the means.
     """
     most = len(times) - 1
     step = min(most, max(1, round(1e9 * most / (times[-1] - times[0]))))

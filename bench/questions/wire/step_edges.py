@@ -1,6 +1,6 @@
 """How late are the setpoints of a test run's steps, on a line with the pace of a real wire?
 
-Some simulated drives in another process are polled, and the frequency of all of them changes at each step. A
+Some simulated drives in another process are polled, and the frequency of all drives changes at each step. A
 setpoint's time is the end of its frame at the drive. It is compared with the planned time of the step, which
 counts from the recorded start of the first step.
 """

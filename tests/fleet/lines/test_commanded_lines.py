@@ -198,7 +198,7 @@ async def test_gateway_does_not_answer_a_stop_if_the_bus_is_closed(
     await settled(subjects)
 
 
-# ---- requests in flight while a line is handed over: each of them gets its row ----
+# ---- requests in flight while a line is handed over: each request gets its row ----
 
 
 NUMBERED = "motor_speed"  # this register has no scale, so its value is the raw count

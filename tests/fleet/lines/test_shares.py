@@ -122,7 +122,7 @@ def test_a_gateway_that_rejoins_a_running_fleet_gets_its_share_immediately() -> 
 
 
 def test_starting_fleet_waits_until_no_more_gateways_join() -> None:
-    """Otherwise the first gateway would read the records of all lines, and the second one half of them."""
+    """Otherwise the first gateway would read all records of lines, and the second one half of the records."""
     trial = Trial()
     assert trial.shared_among("b") == set()
     trial.clock.pass_s(QUIET_NS / SECOND - 0.01)

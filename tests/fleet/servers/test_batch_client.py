@@ -1,4 +1,4 @@
-"""BatchClient: many answers at a time, which of them are accepted, and what happens if one is missing."""
+"""BatchClient: many answers at a time, which answers are accepted, and what happens if one is missing."""
 
 from __future__ import annotations
 

@@ -282,7 +282,7 @@ async def connected(servers: SecuredCluster, url: str) -> AsyncIterator[Mapping[
 
 
 def questions(user: str) -> Iterator[tuple[str, bytes]]:
-    """Yield the requests for stored data that this user may send. The servers answer each of them."""
+    """Yield the requests for stored data that this user may send. The servers answer each request."""
     stream, key = (STREAM, f"{STREAM}.gw-b.log") if user == "hub" else ("KV_own_0", "$KV.own_0.last")
     yield f"$JS.API.DIRECT.GET.{stream}", json.dumps({"last_by_subj": key}).encode()
     yield f"$JS.API.STREAM.INFO.{stream}", b""

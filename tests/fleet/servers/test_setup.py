@@ -133,7 +133,7 @@ def test_init_retries_the_removal_of_the_test_bucket(
 @pytest.mark.long
 @pytest.mark.slow
 def test_init_needs_all_servers_only_when_it_creates_buckets(tmp_path: Path) -> None:
-    """A bucket stored on only two servers would fail with either of them."""
+    """A bucket stored on only two servers would fail with either server."""
     with cluster(tmp_path, 3) as three:
         down = next(node for node in three.nodes if not node.leads_servers())
         others = [node for node in three.nodes if node is not down]

@@ -88,7 +88,7 @@ def receiver(kind: str, folder: Path) -> Iterator[Receiver]:
 
 
 def wanted(exchanges: range) -> Counter[Key]:
-    """Return a Counter that has the key of each row of these exchanges once."""
+    """Return a Counter that has the key of each row of the exchanges once."""
     return Counter(
         (NOON + number * STEP, f"pump-{number % 4 + 1}", f"value_{at}")
         for number in exchanges

@@ -398,7 +398,7 @@ class AskedBus:
 
 
 def ask_all(bus: AskedBus, is_there: Callable[[str], bool], *names: str) -> list[str]:
-    """Check the identities of these drives twice; return "failed" for each unexpected exception."""
+    """Check the identities of the named drives twice; return "failed" for each unexpected exception."""
     drives = [SimpleNamespace(drive=SimpleNamespace(name=name)) for name in names]
     plant = SimpleNamespace(lines=[SimpleNamespace(name="hall", drives=drives)])
     failed: list[str] = []

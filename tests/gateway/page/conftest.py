@@ -1,4 +1,4 @@
-"""Fixtures: Chromium, a fake gateway, and web pages of it. Without Chromium, these tests are skipped."""
+"""Fixtures: Chromium, a fake gateway, and its web pages. Without Chromium, these tests are skipped."""
 
 from __future__ import annotations
 

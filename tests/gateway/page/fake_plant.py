@@ -8,7 +8,7 @@ from typing import Any
 
 from multidrop.gateway.clock import iso_time
 
-# Names by line: one drive in each state. Few, because Chromium draws each of them several times a second.
+# Names by line: one drive in each state. Few, because Chromium draws each drive several times a second.
 NAMES = ("pump-1 pump-2 pump-3 pump-4 conveyor-2", "filler-1 filler-2 labeller", "booster-1 tower-fan-2")
 MANY_NAMES = (
     "pump-1 pump-2 pump-3 pump-4 fan-north fan-south mixer-1 mixer-2 conveyor-1 conveyor-2 screw",
@@ -207,7 +207,7 @@ def lines() -> dict[str, Any]:
 
 
 def fleet(began: float) -> dict[str, Any]:
-    """Return the answer to `GET /api/fleet`: twelve lines and three gateways, one of which has just died."""
+    """Return the answer to `GET /api/fleet`: twelve lines and three gateways. One gateway has just died."""
     at = int(began * 1000)
     spool = {"bytes": 81_234_567, "lost": 0, "behind": 2, "lag_s": 1.4, "trouble": None}
     says = {"state": "working", "margin_s": 2.14, "troubles": {}, "trouble": "", "spool": spool}

@@ -67,7 +67,7 @@ def test_values_are_marked_as_old_if_the_gateway_hangs(opened: Opener, gateway: 
 def test_old_values_stay_old_when_the_clock_of_the_browser_is_set_back(
     opened: Opener, gateway: FakeGateway, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # Delay the gateway's answers until the test has ended, because each of them contains the gateway's time.
+    # Delay the gateway's answers until the test has ended, because each answer contains the gateway's time.
     monkeypatch.setattr(fake_gateway, "HOLD_S", 120)
     page = opened()
     gateway.is_silent = True

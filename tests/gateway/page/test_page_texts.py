@@ -243,7 +243,7 @@ def test_each_language_of_the_page_is_served_as_one_file() -> None:
     assert re.findall(r'  \["(\w+)", "\w+"\],', SCRIPTS["texts.js"]) == ["en", "ru", "zh"]
 
 
-# ---- the page's languages: their choice, and every view in each of them on a narrow screen ----
+# ---- the page's languages: their choice, and every view in each language on a narrow screen ----
 
 
 VIEWS = ("#/drives", "#/drives/pump-1", "#/trends", "#/faults", "#/lines", "#/log", "#/fleet")

@@ -130,7 +130,7 @@ class Served:
         return self.get("/api/frame").json
 
     def await_state(self, drive: str, *states: str) -> None:
-        """Wait until a frame shows the drive in one of these states."""
+        """Wait until a frame shows the drive in one of the states."""
         until(lambda: self.frame()["drives"][drive]["state"] in states)
 
 

@@ -110,7 +110,7 @@ class FakeLine:
 
 
 def plant_of(*drives: tuple[str, Drive], polled: bool = True) -> Plant:
-    """Return a plant that polls all readable registers of these drives, each given with its line's name."""
+    """Return a plant that polls all readable registers of the drives, each given with its line's name."""
     lines: dict[str, list[PolledDrive]] = {}
     for line, drive in drives:
         registers = [register for register in drive.registers.values() if register.readable and polled]

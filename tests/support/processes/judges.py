@@ -52,13 +52,13 @@ class Libmodbus:
         return done.stdout.splitlines()
 
     def hear(self, requests: Sequence[SampleFrame]) -> list[Understood | str]:
-        """Return the server's result for each of these requests, which are all addressed to it."""
+        """Return the server's result for each request. All requests are addressed to the server."""
         return [
             _received(line) for line in self._run(f"request {_text(request.frame)}" for request in requests)
         ]
 
     def ask(self, replies: Sequence[SampleFrame]) -> list[tuple[bytes, Verdict]]:
-        """Return the client's request for each of these replies, and how the client decodes the reply."""
+        """Return the client's request for each reply, and how the client decodes the reply."""
         asked = [reply.request for reply in replies]
         lines = [
             f"reply {ask.address} {ask.function} {ask.start} {ask.count} {_text(ask.data)} "

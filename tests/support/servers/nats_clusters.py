@@ -107,7 +107,7 @@ class Node:
         self.process.wait()
 
     def pause(self) -> None:
-        """Suspend the server; return when all its threads are suspended, so that none of them answers."""
+        """Suspend the server; return when all its threads are suspended, so that no thread answers."""
         os.kill(self.process.pid, signal.SIGSTOP)
         os.waitid(os.P_PID, self.process.pid, os.WSTOPPED)
 

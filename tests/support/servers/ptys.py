@@ -20,7 +20,7 @@ from multidrop.core import set_settings
 
 @contextmanager
 def linked_ptys() -> Iterator[tuple[str, str]]:
-    """Yield the paths of two ports, each of which receives the bytes written to the other."""
+    """Yield the paths of two ports. Each port receives the bytes written to the other."""
     masters, slaves = zip(*(os.openpty() for _ in range(2)), strict=True)
     for slave in slaves:
         tty.setraw(slave)

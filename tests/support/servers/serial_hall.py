@@ -69,7 +69,7 @@ class SerialHall:
         self._thread.start()
 
     def plant(self, every: str = "100 ms") -> str:
-        """Return the text of a plant file that polls one drive on each of these lines."""
+        """Return the text of a plant file that polls one drive on each line."""
         return "\n".join(
             f'[[line]]\nname = "{line.name}"\nport = "socket://{self.host}:{line.port}"\n'
             f'[[line.drive]]\nname = "drive-{line.name}"\nmodel = "innovert-ibd"\naddress = 1\n'
