@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from multidrop._core import ffi, lib
 from multidrop.core.columns import Columns, RowLayout
-from multidrop.core.exchange import Framing, Message, from_c
+from multidrop.core.frame import Framing, Message, from_c
 
 
 class Side(IntEnum):

@@ -17,7 +17,8 @@ from weakref import finalize
 from multidrop._core import ffi, lib
 from multidrop.core.capture import Tap
 from multidrop.core.columns import Columns, RowLayout, flag_at, number_at
-from multidrop.core.exchange import Completion, Exchange, Peer, Status, settings_to_c
+from multidrop.core.exchange import Completion, Exchange, Peer, Status
+from multidrop.core.frame import settings_to_c
 from multidrop.core.permissions import Mastership
 from multidrop.core.process import only_here, register_at_fork
 

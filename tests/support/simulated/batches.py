@@ -18,7 +18,7 @@ from multidrop.core import (
     RowLayout,
     Status,
 )
-from multidrop.core.exchange import to_c
+from multidrop.core.frame import to_c
 from multidrop.polling.batch import Batch, Row
 
 # UTC in ns when the monotonic clock was 0: 2026-11-21 09:29:59.123456789.
