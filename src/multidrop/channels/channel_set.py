@@ -234,7 +234,7 @@ class ChannelSet:
     def _status(self, slots: Iterable[int]) -> int:
         """Return the status of a row that is computed from the newest rows of the given series.
 
-        If some of these rows have no value, it is the status of the newest of them.
+        If some of these rows have no value, it is the status of the newest such row.
         """
         missing = [slot for slot in slots if self._statuses[slot] not in (Status.OK, UNSEEN)]
         if missing:

@@ -30,9 +30,9 @@ WORDS = {  # number of 16-bit words of each format
     NumberFormat.F64: 4,
 }
 FLOATS = {NumberFormat.F16: ">e", NumberFormat.F32: ">f", NumberFormat.F64: ">d"}
-# formats whose values a float64 always holds exactly
+# float formats whose values a float64 always holds exactly
 SHORT_FLOATS = frozenset({NumberFormat.F16, NumberFormat.F32})
-# formats with values that a float64 cannot hold exactly
+# whole-number formats with values that a float64 cannot hold exactly
 WHOLE = frozenset({NumberFormat.U64, NumberFormat.I64})
 # The order of a number's bytes on the wire, for one, two and four words; A is the most significant byte.
 ORDERS = {

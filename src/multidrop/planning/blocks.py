@@ -73,7 +73,7 @@ def plan(
     document allows reading them. The family limits the length of a request; without such a limit, the Modbus
     standard does. Registers of different rates never share a request, because some would be read too often.
     Registers of one `read_together` group always share a request if they have the same rate. Blocks are in
-    the order of these groups. Raises ValueError for a register that cannot be read.
+    the order of the groups. Raises ValueError for a register that cannot be read.
     """
     rates: dict[float | None, list[Register[Any]]] = {}
     for register, every in wanted:

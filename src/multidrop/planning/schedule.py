@@ -2,7 +2,7 @@
 
 The exchanges are planned in advance, up to a horizon, so that the line never waits for Python. A job with a
 period is due at each multiple of the period and never drifts. Among the jobs that are due, the job whose
-period ends first goes first. If there is time for all of them, jobs with equal line settings and silence are
+period ends first goes first. If there is time for all, jobs with equal line settings and silence are
 sent one after another. If a job's period ends before its turn, this poll is counted and skipped for good.
 Then, until the line has caught up, the job that has waited longest goes first, so that each job is carried
 out. Jobs without a period take turns, one round after another, in the remaining time. They have a minimum
@@ -260,7 +260,7 @@ class Schedule(Generic[J]):
             self.remove(job)
 
     def put_in_order(self, drives: Sequence[int]) -> None:
-        """Sort the jobs without a period by the order of these drives, and start a new round."""
+        """Sort the jobs without a period by the given order of drives, and start a new round."""
         places = {drive: place for place, drive in enumerate(drives)}
         self._round.sort(key=lambda job: places[job.drive])
         self._next = 0

@@ -49,7 +49,7 @@ def _made_ns(device: str) -> int:
 
 
 def remember_former_peers(names: Iterable[str], peers: Iterable[tuple[int, Peer]]) -> None:
-    """When a port is closed, keep the records of those drives that may still send late replies.
+    """When a port is closed, keep the records of drives that may still send late replies.
 
     The records are kept under each name of the port. `peers` are pairs of a drive's address and its record.
     """

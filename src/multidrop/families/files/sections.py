@@ -458,7 +458,7 @@ PROOF_KEYS = {
 
 @dataclass(frozen=True)
 class Proof:
-    """A register that identifies the family: its value is in `values`, or between `above` and `below`."""
+    """A register that identifies the family by a value between `above` and `below`, in `values` if any."""
 
     register: str
     values: tuple[float, ...]  # accepted values; empty: every value in the range is accepted

@@ -243,7 +243,7 @@ class ModbusClient(asyncio.Protocol):
 class RoundShare:
     """Divides the event loop's time among all clients with waiting requests.
 
-    In a round, each of these clients has one turn, in which some of its requests are answered.
+    In a round, each such client has one turn, in which some of its requests are answered.
     """
 
     def __init__(self) -> None:

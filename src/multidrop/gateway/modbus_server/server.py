@@ -117,7 +117,7 @@ class ModbusServer:
     # ---- requests ----
 
     def serve(self, port: str, request: MbapRequest, client: ModbusClient) -> Answer:
-        """Return the answer to a request, or an awaitable of it.
+        """Return the answer to a request, or an awaitable that returns the answer.
 
         Return None for a broadcast, which has no answer. The caller then closes the connection.
         """

@@ -1,4 +1,4 @@
-"""The commands that an MQTT broker delivers: which of them are carried out, and the report of each result.
+"""The commands that an MQTT broker delivers: which commands are carried out, and the report of each result.
 
 A broker may delay, retain and duplicate messages. So a write or a verb is carried out only if it is not a
 copy and was sent at most MOST_AGE_S ago. It must also have been sent after the latest stop of its drive and
