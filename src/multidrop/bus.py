@@ -17,12 +17,13 @@ from multidrop.control.records import AuditLog, WriteRecords
 from multidrop.control.stops import Stopper, StopRun
 from multidrop.control.writer import Writer
 from multidrop.core import RS485, Echo, Mastership, Peer, TransactionIds
-from multidrop.core.process import log_aside, register_at_fork, undisturbed
+from multidrop.core.process import register_at_fork, undisturbed
 from multidrop.drive.family import Drive, check_drive
 from multidrop.drive.register import Register
 from multidrop.drive.state import State
 from multidrop.drive.verbs import TRIES
 from multidrop.errors import BusError, LineError
+from multidrop.transport.aside_log import log_aside
 from multidrop.transport.exchange import Exchanges
 from multidrop.transport.line import Line
 from multidrop.transport.statistics import LineMeter, LineStatistics

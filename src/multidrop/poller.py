@@ -25,7 +25,7 @@ from multidrop.core import (
     RowQueue,
     why_not_realtime,
 )
-from multidrop.core.process import log_aside, register_at_fork, traceback_of, undisturbed, words_of
+from multidrop.core.process import register_at_fork, undisturbed
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.errors import LineError, PollingFailed
@@ -37,6 +37,7 @@ from multidrop.polling.line_set import LineSet
 from multidrop.polling.row_source import RowSource
 from multidrop.toml_check import check_period
 from multidrop.transport import clock
+from multidrop.transport.aside_log import log_aside, traceback_of, words_of
 from multidrop.transport.statistics import LineStatistics
 
 # interval between checks of the lines, if a line has a problem, or if the program has called `fileno`

@@ -22,10 +22,10 @@ from multidrop.control.eeprom_ledger import Ledger, LedgerCell
 from multidrop.control.outcome import Effect
 from multidrop.control.records import AuditLog, noted_first, read_audit, written_by
 from multidrop.core import Message
-from multidrop.core.process import flush_log
 from multidrop.errors import Unconfirmed, WriteForbidden
 from multidrop.families import DelixiModbus, ErmanERG220, InvtCHE
 from multidrop.sim import simulated
+from multidrop.transport.aside_log import flush_log
 
 CELL = LedgerCell("/dev/ttyUSB0", 1, "delixi-modbus", "frequency")
 HOUR = 3600.0

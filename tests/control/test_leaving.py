@@ -15,11 +15,11 @@ from lines import until
 from simulated_bus import SimulatedBus, che_drives, one
 
 from multidrop.core import Message
-from multidrop.core.process import flush_log
 from multidrop.drive import Drive
 from multidrop.errors import CancelledByStop, NotAttached, PortLost
 from multidrop.families import InvtCHE
 from multidrop.sim import simulated
+from multidrop.transport.aside_log import flush_log
 
 
 class RunningPair:

@@ -28,7 +28,6 @@ from multidrop.control.eeprom_ledger import Ledger, LedgerCell, default_ledger_p
 from multidrop.control.ramp import start_staggered
 from multidrop.control.records import noted_first, read_audit, written_by
 from multidrop.core import Completion, Exchange
-from multidrop.core.process import flush_log
 from multidrop.drive import Condition, Drive
 from multidrop.drive.register import COIL, Kept, setting
 from multidrop.errors import BusError, DriveException, LineError, Unconfirmed, WriteForbidden
@@ -36,6 +35,7 @@ from multidrop.families import YD1000, InvtCHE
 from multidrop.families.invt_che import CHEControl
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
 from multidrop.transport import port_identity
+from multidrop.transport.aside_log import flush_log
 from multidrop.transport.line import Line
 from multidrop.transport.port_identity import is_simulated
 

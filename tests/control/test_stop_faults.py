@@ -32,12 +32,12 @@ from multidrop.control.ramp import start_staggered
 from multidrop.control.records import WriteRecords
 from multidrop.control.stops import LEAST_S, StopAttempt, stop_together
 from multidrop.core import Completion, Exchange
-from multidrop.core.process import flush_log
 from multidrop.drive import Drive, Script, carry_out, insist, read, until, verb, wait, write
 from multidrop.errors import CancelledByStop, Unconfirmed, WriteForbidden
 from multidrop.families import InvtCHE
 from multidrop.sim import MotorDrive, simulated
 from multidrop.transport import clock
+from multidrop.transport.aside_log import flush_log
 
 STOPPING = ramp._stop.__code__
 NO_MEMORY, NO_DESCRIPTORS = MemoryError(), OSError(EMFILE, "Too many open files")

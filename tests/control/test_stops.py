@@ -35,7 +35,6 @@ from multidrop.control.outcome import UNSEEN, Seen
 from multidrop.control.ramp import ramp, start_staggered
 from multidrop.control.stops import AT_ONCE, LEAST_S, PAUSE_S
 from multidrop.core import Completion, Exchange, Message
-from multidrop.core.process import flush_log
 from multidrop.drive import Condition, Drive, Script, read, wait, write
 from multidrop.drive.register import reading
 from multidrop.drive.verbs import verb
@@ -43,6 +42,7 @@ from multidrop.errors import BusError, CancelledByStop, DriveException, LineErro
 from multidrop.families import YD1000, DelixiModbus, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.sim import simulated
 from multidrop.transport import clock
+from multidrop.transport.aside_log import flush_log
 
 every_family = pytest.mark.parametrize("model", MAKE)
 

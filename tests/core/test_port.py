@@ -284,7 +284,7 @@ import logging, os, resource
 from contextlib import suppress
 from multidrop import Plant, Poller
 from multidrop.core import Realtime, wake_lateness
-from multidrop.core import process
+from multidrop.transport import aside_log
 logging.basicConfig(format="%(message)s")
 resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
 if os.geteuid() == 0:
@@ -301,7 +301,7 @@ with Poller(Plant(()), realtime=True) as poller:
         with suppress(ProcessLookupError):  # this thread has just ended
             policies.add(os.sched_getscheduler(int(thread)))
     print(policies)
-process.flush_log(10)
+aside_log.flush_log(10)
 """
     run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert run.stdout.splitlines() == ["refused", "refused", str({os.SCHED_OTHER})], run.stderr

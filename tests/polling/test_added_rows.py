@@ -20,7 +20,7 @@ from recordings import recorded
 from toy import Toy
 
 from multidrop.channels import Channel
-from multidrop.core import STATUSES, Message, process
+from multidrop.core import STATUSES, Message
 from multidrop.families import InvtCHE
 from multidrop.plant.loader import PlantError
 from multidrop.plant.model import Plant, PolledDrive
@@ -30,6 +30,7 @@ from multidrop.polling.batch import Batch, Row
 from multidrop.polling.jobs import RowNames
 from multidrop.recording import open_writer
 from multidrop.sim import EncodedDrive, Simulator, Wire, proof, simulated
+from multidrop.transport.aside_log import flush_log
 
 CURRENT = Toy.registers["output_current"]
 DOUBLE = Channel("double", "output_current * 2", "A")
@@ -245,7 +246,7 @@ def test_an_outage_is_logged_without_a_row_if_no_status_code_is_free(
     rows = [AddedRow(ns, ns, 0, *codes, 0, 1.0) for ns in (10**9, 344_000_000_000)]
     with caplog.at_level(logging.WARNING):
         batch = added.added_to(Batch(JoinedColumns(None, rows), names.drives, names.registers))
-        process.flush_log(5)
+        flush_log(5)
     assert batch is not None
     assert [row.register for row in batch] == ["output_current"] * 2 + ["charge"] * 2
     assert "343 s without values" in caplog.text

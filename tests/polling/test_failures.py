@@ -16,7 +16,6 @@ from toy import Toy
 
 from multidrop import PollingFailed
 from multidrop.core import Port, RowQueue
-from multidrop.core.process import flush_log
 from multidrop.drive import Drive
 from multidrop.poller import Poller
 from multidrop.polling import polled_line
@@ -24,6 +23,7 @@ from multidrop.polling.batch import Batch, Row
 from multidrop.polling.jobs import PortQueue
 from multidrop.sim import EncodedDrive, Simulator, Wire, proof, simulated
 from multidrop.transport import clock
+from multidrop.transport.aside_log import flush_log
 from multidrop.transport.network_port import Bridge
 
 FAILED = "not asked: polling failed"

@@ -16,11 +16,10 @@ from simulated_bus import one
 from toy import PatientToy
 
 from multidrop import Bus, LineError, WriteForbidden
-from multidrop.core import process
-from multidrop.core.process import flush_log
 from multidrop.families import InvtCHE
 from multidrop.sim import SimulatedDrive, Simulator, Wire
-from multidrop.transport import clock
+from multidrop.transport import aside_log, clock
+from multidrop.transport.aside_log import flush_log
 from multidrop.transport.line import MOST_LOSSES, LineLog
 
 pytestmark = pytest.mark.usefixtures("_patient")
@@ -172,16 +171,16 @@ def test_stop_is_repeated_while_a_log_handler_hangs() -> None:
 
 
 def test_log_queue_stays_bounded_while_a_handler_hangs(monkeypatch: pytest.MonkeyPatch) -> None:
-    aside = process.AsideThread("log")
-    monkeypatch.setattr(process, "_log_thread", aside)
+    aside = aside_log.AsideThread("log")
+    monkeypatch.setattr(aside_log, "_log_thread", aside)
     handler, logger = Hanging(), logging.getLogger("multidrop.line")
     logger.addHandler(handler)
     try:
-        process.log_aside(logger, logging.WARNING, "the first record")
+        aside_log.log_aside(logger, logging.WARNING, "the first record")
         assert handler.has_begun.wait(PATIENCE)
-        for number in range(2 * process.MOST_WAITING):
-            process.log_aside(logger, logging.WARNING, "%d", number)
-        assert aside._work.qsize() == process.MOST_WAITING
+        for number in range(2 * aside_log.MOST_WAITING):
+            aside_log.log_aside(logger, logging.WARNING, "%d", number)
+        assert aside._work.qsize() == aside_log.MOST_WAITING
     finally:
         handler.released.set()
         logger.removeHandler(handler)

@@ -21,13 +21,13 @@ from multidrop.control.eeprom_ledger import LEAST_INTERVAL, YEARLY, Ledger, Ledg
 from multidrop.control.outcome import Effect, Stopped
 from multidrop.control.rules import refused
 from multidrop.core import Message, build_request
-from multidrop.core.process import AsideThread, log_aside
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Kept, Register
 from multidrop.errors import Advice
 from multidrop.iso_time import format_time
 from multidrop.printable import printable
 from multidrop.transport import clock
+from multidrop.transport.aside_log import AsideThread, log_aside
 from multidrop.transport.line import Line
 
 T = TypeVar("T")

@@ -18,7 +18,6 @@ from multidrop.control.call import Latches
 from multidrop.control.outcome import UNSEEN, Outcome, Seen, Stopped, result_of_stop
 from multidrop.control.writer import Checked, Writer
 from multidrop.core import Message
-from multidrop.core.process import log_aside
 from multidrop.drive.family import Drive
 from multidrop.drive.verbs import CommandResult, Pulse, Read, Script, Step, Wait, Write
 from multidrop.errors import (
@@ -36,6 +35,7 @@ from multidrop.errors import (
     WriteForbidden,
 )
 from multidrop.transport import clock
+from multidrop.transport.aside_log import log_aside
 from multidrop.transport.exchange import WRITE_TIMEOUT, Exchanges
 
 LEAST_S = 30.0  # s; how long a stop is repeated by default

@@ -16,12 +16,12 @@ from weakref import ref
 from multidrop.channels import OLD, ChannelSet, SlotRow
 from multidrop.core import Columns
 from multidrop.core.columns import COLUMNS
-from multidrop.core.process import AsideThread, log_aside
 from multidrop.drive.family import Drive
 from multidrop.plant.model import Plant, series_of
 from multidrop.polling.batch import Batch, CopiedColumns, slot_rows, status_code
 from multidrop.polling.jobs import RowNames
 from multidrop.transport import clock
+from multidrop.transport.aside_log import AsideThread, log_aside
 from multidrop.transport.port_identity import is_simulated, of_name
 from multidrop.whole_file import whole_file
 

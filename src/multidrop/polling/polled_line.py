@@ -12,7 +12,7 @@ from typing import Any
 
 from multidrop.bus import Bus
 from multidrop.core import Peer, Port, RowQueue, Status
-from multidrop.core.process import log_aside, register_at_fork, traceback_of, words_of
+from multidrop.core.process import register_at_fork
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
 from multidrop.errors import LineError
@@ -22,6 +22,7 @@ from multidrop.plant.model import PlantLine, PolledDrive
 from multidrop.polling.jobs import JobMaker, PlannedJobs, PolledJob, PortQueue, RowNames, Slot
 from multidrop.polling.refusals import Refusals
 from multidrop.transport import clock
+from multidrop.transport.aside_log import log_aside, traceback_of, words_of
 from multidrop.transport.drive_records import GONE_S
 from multidrop.transport.statistics import Statistics, line_statistics
 

@@ -13,11 +13,11 @@ from __future__ import annotations
 import logging
 
 from multidrop.core import RowLayout
-from multidrop.core.process import log_aside
 from multidrop.drive.family import Drive
 from multidrop.planning.blocks import Block, halves, least
 from multidrop.planning.schedule import Schedule
 from multidrop.polling.jobs import JobMaker, PolledJob
+from multidrop.transport.aside_log import log_aside
 
 REFUSALS = 3  # exceptions in a row after which a block is split or a register is set aside
 FAILURES = 3  # unanswered requests in a row after which a block is split

@@ -22,10 +22,11 @@ from multidrop.core import (
     TransactionIds,
     build_request,
 )
-from multidrop.core.process import flush_log, log_aside, register_at_fork, undisturbed, words_of
+from multidrop.core.process import register_at_fork, undisturbed
 from multidrop.drive.line_settings import check_settle, speaks_tcp
 from multidrop.errors import LineError, NoSuchPort, PortLost
 from multidrop.transport import clock
+from multidrop.transport.aside_log import flush_log, log_aside, words_of
 from multidrop.transport.network_port import PORT_FAILURES
 from multidrop.transport.open_port import (
     CLOSING_S,

@@ -22,8 +22,8 @@ from serial import rfc2217
 from serial.urlhandler.protocol_socket import Serial
 
 from multidrop.core import crc16
-from multidrop.core.process import log_aside, traceback_of
 from multidrop.drive.line_settings import MODBUS_PORT
+from multidrop.transport.aside_log import log_aside, traceback_of
 
 
 class SocketPort(Serial):
