@@ -147,7 +147,7 @@ _SWITCHES = {
 }
 
 
-NICE = -10  # nice value of threads that pass on polled values, if realtime scheduling is requested
+NICE = -10  # nice value of threads that pass on polled values, if realtime scheduling was granted
 
 
 class _Engine:
@@ -222,9 +222,9 @@ class _Engine:
 
 
 class Realtime:
-    """One user's wish that the C core's thread runs with realtime scheduling, before all normal threads.
+    """A client's request for realtime scheduling of the C core's thread, which then precedes normal threads.
 
-    The thread has realtime scheduling while any user requests it. It returns to normal scheduling by itself
+    The thread has realtime scheduling while any client requests it. It returns to normal scheduling by itself
     if it uses more than half of a processor.
     """
 
@@ -236,8 +236,7 @@ class Realtime:
         """Request realtime scheduling, or withdraw the request. Raises OSError if the system refuses."""
         if wanted != self.is_wanted:
             self.is_wanted = wanted
-            # Cleared first: otherwise `has_ended` could take a requested end for one by itself.
-            self.is_held = False
+            self.is_held = False  # first: `has_ended` must not report an end that was requested
             _engine.set_realtime(self, wanted)
             self.is_held = wanted
 

@@ -295,7 +295,7 @@ class OpenPort:
         if self._terminal and found and self._terminal.is_replaced_by(found):
             raise LineError(
                 self.name,
-                f"the port's pseudo-terminal is gone, and another pseudo-terminal is now {found.device}",
+                f"the port's pseudo-terminal is gone, and {found.device} is now a different one",
             )
         return found
 
