@@ -329,16 +329,23 @@ def test_no_c_function_is_longer_than_the_limit() -> None:
 
 ARCHITECTURE = ROOT / "docs" / "reference" / "architecture.md"
 WALKS = sorted((ROOT / "docs" / "reference" / "walks").glob("*.md"))
-STEP = re.compile(r"`(?:(?:src/multidrop/)?([\w/]+\.py):([\w.]+)|(?:csrc/)?(\w+\.c))`")
+STEP = re.compile(r"`(?:(?:src/multidrop/)?([\w/]+\.py):([\w.]+)|(?:csrc/)?(\w+\.c)(?::(\w+))?)`")
+C_FUNCTION = re.compile(r"^[a-z][\w ]*?[ *](\w+)\([^;{]*?\)\s*\{", re.MULTILINE)
 
 
 def steps(walk: Path) -> list[tuple[str, str]]:
-    """Return the steps of a walkthrough: each file with its function or class ("" for a C file)."""
-    return [(file or c_file, name) for file, name, c_file in STEP.findall(walk.read_text("utf-8"))]
+    """Return the steps of a walkthrough: each file with its function or class, or with ""."""
+    found = STEP.findall(walk.read_text("utf-8"))
+    return [(file or c_file, name or c_name) for file, name, c_file, c_name in found]
 
 
 def defined(path: Path) -> set[str]:
-    """Return the functions and classes of a module, and the methods of its classes as `Class.method`."""
+    """Return the functions of a C file, or the functions and classes of a module.
+
+    The methods of a module's classes are included as `Class.method`.
+    """
+    if path.suffix == ".c":
+        return set(C_FUNCTION.findall(path.read_text("utf-8")))
     names = set()
     for node in parsed(path).body:
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
@@ -351,12 +358,12 @@ def defined(path: Path) -> set[str]:
 
 def missing(walk: Path) -> list[str]:
     """Return the steps whose file, function or class does not exist."""
-    return [
-        f"{file}:{name}"
-        for file, name in steps(walk)
-        if not (ROOT / "csrc" / file if file.endswith(".c") else PACKAGE / file).exists()
-        or (name and name not in defined(PACKAGE / file))
-    ]
+    found = []
+    for file, name in steps(walk):
+        path = (ROOT / "csrc" if file.endswith(".c") else PACKAGE) / file
+        if not path.exists() or (name and name not in defined(path)):
+            found.append(f"{file}:{name}")
+    return found
 
 
 def test_every_file_has_a_row_on_the_architecture_page() -> None:
@@ -377,5 +384,8 @@ def test_each_step_of_a_walkthrough_names_existing_code(walk: Path) -> None:
 
 def test_missing_code_in_a_walkthrough_is_detected(tmp_path: Path) -> None:
     walk = tmp_path / "walk.md"
-    walk.write_text("`poller.py:Poller.take_off`, `nowhere.c`, `poller.py:Poller`, `csrc/line.c`")
-    assert missing(walk) == ["poller.py:Poller.take_off", "nowhere.c:"]
+    walk.write_text(
+        "`poller.py:Poller.take_off`, `nowhere.c`, `poller.py:Poller`, `csrc/line.c`, `csrc/line.c:finish`, "
+        "`line.c:md_line_gone`"
+    )
+    assert missing(walk) == ["poller.py:Poller.take_off", "nowhere.c:", "line.c:md_line_gone"]
