@@ -81,7 +81,7 @@ def test_a_terminal_of_80_by_24_shows_twelve_lines_with_their_masters() -> None:
     text = drawn(told(lines=12), 80, 24)
     assert re.search(r"^line-0 +none +\| line-3", text, re.MULTILINE)
     assert len(re.findall(r"line-\d+ +(?:gw-1|none)", text)) == 12
-    assert "last moves:" in text
+    assert "last changes of master:" in text
 
 
 def test_screen_shows_only_the_newest_notes_that_fit() -> None:
@@ -128,7 +128,7 @@ def test_long_text_is_wrapped_or_marked_as_cut() -> None:
 def test_each_table_header_on_the_screen_has_a_row_below(height: int) -> None:
     rows = drawn(told(lines=12), 80, height).splitlines()
     for row, next_row in pairwise(rows):
-        if row.startswith(("LINE ", "last moves")):
+        if row.startswith(("LINE ", "last changes of master")):
             assert re.match(r"line-|1970-", next_row), (row, next_row)
 
 

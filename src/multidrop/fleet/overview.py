@@ -68,7 +68,7 @@ class FleetView:
         return {name: self._records.plant.records[name] for name in self._records.lines()}
 
     def fleet(self) -> dict[str, Any]:
-        """Return living and missing gateways, lines with their masters, and the last moves.
+        """Return living and missing gateways, lines with their masters, and the last changes of master.
 
         A dead gateway is listed as living until another one has ended its session. If a gateway does not
         answer, its `says` is None. `unseen_s` is the time in s since a renewal of its lease was last

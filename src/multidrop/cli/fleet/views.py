@@ -105,7 +105,7 @@ async def _print_status(arguments: argparse.Namespace, paths: list[ServerPath]) 
     else:
         lines = [*gateway_table(found), "", count_sentence(found), *trouble_sentences(found)]
         if found["moves"]:
-            lines += ["", "last moves:", *move_table(found["moves"])]
+            lines += ["", "last changes of master:", *move_table(found["moves"])]
         print_text("\n".join(lines))
     unpolled = (kind(found) for kind in (free_lines, unanswered_lines, lost_lines, failing_lines))
     return int(any((found.get("missing"), *unpolled)))
@@ -161,7 +161,7 @@ def _body(fleet: FleetState, width: int, room: int) -> list[str]:
         lines = columns if len(columns) <= room // 2 else lines
     moves_room = max(min(MOVES, room // 2), room - len(lines)) - 2
     rows = move_table(fleet["moves"][: max(0, moves_room)], width - 1)
-    moves = ["", "last moves:", *rows] if rows else []
+    moves = ["", "last changes of master:", *rows] if rows else []
     return [*begin, *_first_lines(lines, room - len(moves)), *moves]
 
 
@@ -207,7 +207,7 @@ def _row(text: str, width: int, is_old: bool) -> TextLine:
     style: Any = "dim" if is_old else ""
     if "no answer" in text or "  none" in text:
         style = "bold red"
-    elif text.startswith(("GATEWAY ", "LINE ", "last moves")):
+    elif text.startswith(("GATEWAY ", "LINE ", "last changes of master")):
         style = "bold underline"
     return TextLine(_cut(text, width), style=style)
 

@@ -30,7 +30,7 @@ const TABLES = {
     ],
   ],
   lines: [t("Lines"), [t("Line"), t("Port"), t("Master"), t("Since")]],
-  moves: [t("Latest moves"), [t("Line"), t("Time"), t("From"), t("To")]],
+  moves: [t("Latest changes of master"), [t("Line"), t("Time"), t("From"), t("To")]],
 };
 
 let newest = null,
