@@ -6,7 +6,6 @@ import sqlite3
 import threading
 from collections.abc import Callable
 from contextlib import suppress
-from decimal import Decimal
 from errno import EMFILE
 from fractions import Fraction
 from functools import cache
@@ -273,8 +272,8 @@ def test_the_stop_result_says_that_no_file_descriptor_was_left(monkeypatch: pyte
     assert 5 <= line.seconds - begun < 6
 
 
-@pytest.mark.parametrize("seconds", [Decimal(12), Fraction(12), 10**400], ids=["decimal", "fraction", "huge"])
-def test_a_stop_accepts_any_number_type_for_seconds(seconds: Any) -> None:
+@pytest.mark.parametrize("seconds", [Fraction(12), 10**400], ids=["fraction", "huge"])
+def test_a_stop_accepts_any_real_number_of_seconds(seconds: Any) -> None:
     line, drives, sims = che_drives(runs_s=10)
     deaf_until = line.seconds + (20 if seconds == 12 else 2 * LEAST_S)
     line.deafens = lambda request: clock.now_ns() < deaf_until * 1e9

@@ -8,9 +8,8 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from decimal import Decimal
 from functools import partial
-from math import inf, nan
+from math import inf
 from numbers import Real
 from typing import Any, TypeVar
 
@@ -554,13 +553,11 @@ def _limit(seconds: float | None) -> float | None:
     """
     if seconds is None:
         return None
-    if isinstance(seconds, (Real, Decimal)) and not isinstance(seconds, bool):
+    if isinstance(seconds, Real) and not isinstance(seconds, bool):
         try:
-            limit = float(seconds)  # a Decimal cannot be added to a float
+            limit = float(seconds)
         except OverflowError:
             limit = inf if seconds > 0 else -inf
-        except ValueError:
-            limit = nan  # Decimal("sNaN")
         if limit >= 0:
             return limit
     sentence = (
