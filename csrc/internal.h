@@ -167,7 +167,7 @@ int md_waiter_wait(struct md_waiter *waiter, void **ready, int room, int64_t tim
 
 int md_port_keep_rts(int fd); /* leave RTS unchanged when the port is closed; return 0 or -errno */
 
-/* ---- wakeup.c ---- */
+/* ---- waiter.c: wake the waiting thread ---- */
 
 struct md_wakeup {
     int fd, ringer; /* `fd` is readable from md_wakeup_ring() until md_wakeup_silence() */

@@ -1,15 +1,17 @@
-/* Wait for many descriptors together: with epoll on Linux, with poll() on other POSIX systems. */
+/* Wait for many descriptors together: with epoll on Linux, with poll() on other POSIX systems. A pipe wakes
+ * the waiting thread. */
 #define _GNU_SOURCE
 #include "internal.h"
 
 #include <errno.h>
+#include <fcntl.h>
 #include <poll.h>
 #include <stdlib.h>
+#include <unistd.h>
 
 #if defined __linux__ && !defined MD_WAITS_BY_POLL
 #include <sys/epoll.h>
 #include <sys/syscall.h>
-#include <unistd.h>
 
 #ifndef SYS_epoll_pwait2
 #define SYS_epoll_pwait2 (-1) /* headers before Linux 5.11 lack it; system call -1 always fails */
@@ -190,3 +192,42 @@ int md_waiter_wait(struct md_waiter *waiter, void **ready, int room, int64_t tim
 }
 
 #endif
+
+/* ---- the wake-up: a pipe with which any thread wakes the waiting thread ---- */
+
+static int set_up(int fd)
+{
+    return fcntl(fd, F_SETFD, FD_CLOEXEC) == 0 && fcntl(fd, F_SETFL, O_NONBLOCK) == 0;
+}
+
+int md_wakeup_make(struct md_wakeup *wakeup)
+{
+    int ends[2];
+    if (pipe(ends))
+        return -1;
+    *wakeup = (struct md_wakeup){.fd = ends[0], .ringer = ends[1]};
+    if (set_up(ends[0]) && set_up(ends[1]))
+        return 0;
+    md_wakeup_destroy(wakeup);
+    return -1;
+}
+
+void md_wakeup_destroy(struct md_wakeup *wakeup)
+{
+    close(wakeup->fd);
+    close(wakeup->ringer);
+}
+
+void md_wakeup_ring(struct md_wakeup *wakeup)
+{
+    if (!atomic_exchange(&wakeup->is_rung, 1))
+        (void)!write(wakeup->ringer, "", 1);
+}
+
+/* If another thread calls md_wakeup_ring() meanwhile, its byte stays in the pipe: no wake-up is lost. */
+void md_wakeup_silence(struct md_wakeup *wakeup)
+{
+    char byte;
+    atomic_store(&wakeup->is_rung, 0);
+    (void)!read(wakeup->fd, &byte, 1);
+}

@@ -1,45 +1,22 @@
 /* A client (a thread that asks for an exchange) wakes the engine's thread only if this thread would otherwise
  * serve the port too late. */
-#include "internal.h"
+#define md_wakeup_ring ring
+#include "posix/waiter.c"
+#undef md_wakeup_ring
 
 #include <assert.h>
-#include <fcntl.h>
-#include <poll.h>
 #include <pthread.h>
 #include <sys/socket.h>
-#include <unistd.h>
 
 enum { WANTED = 3, MOST_TRIES = 200 };
 static const int64_t SILENCE_NS = 50000000, EARLY_NS = 80000, TIMEOUT_NS = INT64_C(5000000000);
 
 static atomic_int rings;
 
-/* ---- these functions replace wakeup.c ---- */
-
-int md_wakeup_make(struct md_wakeup *wakeup)
-{
-    int ends[2];
-    int made = pipe(ends);
-    *wakeup = (struct md_wakeup){.fd = ends[0], .ringer = ends[1]};
-    return made;
-}
-
-void md_wakeup_destroy(struct md_wakeup *wakeup)
-{
-    close(wakeup->fd);
-    close(wakeup->ringer);
-}
-
 void md_wakeup_ring(struct md_wakeup *wakeup)
 {
     atomic_fetch_add(&rings, 1);
-    (void)!write(wakeup->ringer, "", 1);
-}
-
-void md_wakeup_silence(struct md_wakeup *wakeup)
-{
-    char byte;
-    (void)!read(wakeup->fd, &byte, 1);
+    ring(wakeup);
 }
 
 /* ---- a drive that answers immediately ---- */

@@ -62,7 +62,7 @@ def test_threads_can_open_and_close_ports(build: Callable[..., None], sanitizers
 @pytest.mark.slow
 @WAITS_BY_EPOLL
 def test_core_thread_is_not_woken_by_a_call_during_silence(build: Callable[..., None]) -> None:
-    build("test_wakings", *core_without("wakeup"))
+    build("test_wakings", *core_without("waiter"))
 
 
 @pytest.mark.slow
