@@ -1,10 +1,12 @@
-"""Make texts safe to show, parse numbers, and make hints: similar names, commands that install libraries."""
+"""Write values as text and parse them: safe texts, numbers, times; hints: similar names, install commands."""
 
 from __future__ import annotations
 
 import re
 import shlex
 from collections.abc import Iterable
+from datetime import datetime, timedelta
+from functools import lru_cache
 from typing import TypeGuard
 
 # Stricter than int() and float(), which also accept `1_0` for 10, and digits of all scripts.
@@ -15,6 +17,8 @@ _NUMBER = re.compile(
 # limit of a number's digits, below Python's limit of 4300, whose error message would confuse users
 MOST_DIGITS = 100
 _FORMULA = re.compile(r"'*[=+\-@\t\r\n]")
+_EPOCH = datetime(1970, 1, 1)
+_SECOND_NS = 1_000_000_000
 _LOGIN = re.compile(r"(?<=://)[^\s\"]*@")  # up to the last @, because a password may contain an @
 
 
@@ -67,6 +71,30 @@ def is_number(value: object) -> TypeGuard[float]:
 def is_whole(value: object) -> TypeGuard[int]:
     """Return True for an int that is not a bool."""
     return isinstance(value, int) and not isinstance(value, bool)
+
+
+def format_time(time_ns: int) -> str:
+    """Return ns since 1970 (UTC) as ISO 8601 text, such as 2026-11-21T09:30:00.123456789Z."""
+    second, rest = divmod(time_ns, _SECOND_NS)
+    return f"{_format_second(second)}.{rest:09d}Z"
+
+
+def parse_time(text: str) -> int:
+    """Return the ns since 1970 (UTC). Raises ValueError unless the text has the form of `format_time`."""
+    second, dot, rest = text.partition(".")
+    if not dot or len(rest) != 10 or rest[-1] != "Z":
+        raise ValueError(text)
+    return _parse_second(second) * _SECOND_NS + int(rest[:-1])
+
+
+@lru_cache(maxsize=1024)
+def _format_second(second: int) -> str:
+    return (_EPOCH + timedelta(seconds=second)).isoformat()
+
+
+@lru_cache(maxsize=1024)
+def _parse_second(text: str) -> int:
+    return (datetime.fromisoformat(text).replace(tzinfo=None) - _EPOCH) // timedelta(seconds=1)
 
 
 def nearest_names(name: str, known: Iterable[str], most: int) -> list[str]:

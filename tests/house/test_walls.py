@@ -21,7 +21,7 @@ OUTSIDE = {
 }
 # packages by layer, the lowest layer first: a package may import only from lower layers
 LAYERS = [
-    {"errors", "exposition", "iso_time", "printable", "supervisor", "toml_document", "whole_file"},
+    {"errors", "exposition", "printable", "supervisor", "toml_document", "whole_file"},
     {"toml_check"},
     {"core"},
     {"drive"},
@@ -90,7 +90,6 @@ OPEN = {
         "samples.sample_tables",
         "errors",
         "exposition",
-        "iso_time",
         "printable",
         "supervisor",
         "toml_check",

@@ -37,9 +37,9 @@ from multidrop.core import (
 from multidrop.drive.family import Drive
 from multidrop.drive.number_format import bits_in
 from multidrop.drive.register import Carrier, Register, row_field
-from multidrop.iso_time import format_time
 from multidrop.plant.model import Plant, PlantLine
 from multidrop.polling.batch import Batch
+from multidrop.printable import format_time
 
 # ---- pairs of request and reply; bytes outside of frames are junk ----
 

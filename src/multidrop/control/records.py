@@ -24,8 +24,7 @@ from multidrop.core import Message, build_request
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Kept, Register
 from multidrop.errors import Advice
-from multidrop.iso_time import format_time
-from multidrop.printable import printable
+from multidrop.printable import format_time, printable
 from multidrop.transport import clock
 from multidrop.transport.aside_log import AsideThread, log_aside
 from multidrop.transport.line import Line

@@ -22,8 +22,8 @@ from multidrop.drive.parameters import Parameter, parameters_of
 from multidrop.drive.register import Register
 from multidrop.drive.state import Condition
 from multidrop.errors import Advice, BusError, CancelledByStop, Unsupported, WriteForbidden
-from multidrop.iso_time import format_time
 from multidrop.params.values import ParameterSet, Progress, check_same_model, parameter_of, read, text_of
+from multidrop.printable import format_time
 from multidrop.transport import clock
 
 # ---- the plan ----

@@ -10,8 +10,8 @@ from multidrop.core import Framing
 from multidrop.drive.family import Drive
 from multidrop.drive.parameters import Parameter, parameters_of
 from multidrop.errors import DriveException, NoReply, NotAttached, NoValue, Unsupported
-from multidrop.iso_time import format_time
 from multidrop.planning.blocks import Block, blocks, halves
+from multidrop.printable import format_time
 from multidrop.transport import clock
 
 ILLEGAL_FUNCTION = 1  # exception code: the drive does not support the function of this read

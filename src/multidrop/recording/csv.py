@@ -11,9 +11,8 @@ from itertools import islice
 from pathlib import Path
 from typing import BinaryIO
 
-from multidrop.iso_time import format_time, parse_time
 from multidrop.polling.batch import ROW_COLUMNS, Row, Rows
-from multidrop.printable import spreadsheet_text
+from multidrop.printable import format_time, parse_time, spreadsheet_text
 from multidrop.recording.format import AppendingWriter, Metadata, RecordingReader, dump_metadata, writing
 from multidrop.recording.rows import from_rows
 from multidrop.whole_file import whole_file

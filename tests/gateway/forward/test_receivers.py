@@ -34,7 +34,7 @@ from tables import first_in_ci
 
 from multidrop.gateway.forward.influx import line_protocol
 from multidrop.gateway.sending import post
-from multidrop.iso_time import parse_time
+from multidrop.printable import parse_time
 from multidrop.samples import unpack
 
 DOCS = Path(__file__).parents[3] / "docs"

@@ -28,7 +28,7 @@ from multidrop.gateway.mqtt.broker import Login, parse_broker
 from multidrop.gateway.mqtt.rows import json_rows
 from multidrop.gateway.mqtt.settings import MqttSettings
 from multidrop.gateway.parts import PARTS
-from multidrop.iso_time import parse_time
+from multidrop.printable import parse_time
 from multidrop.samples import ROWS, Spool
 
 Key = tuple[int, str, str]  # the fields that identify a row: time in ns, drive, register

@@ -26,8 +26,7 @@ from multidrop.gateway.clock import monotonic_ns
 from multidrop.gateway.metrics import counter
 from multidrop.gateway.reload import changed_drives
 from multidrop.gateway.sending import Refused, RetryingSender
-from multidrop.iso_time import format_time
-from multidrop.printable import printable
+from multidrop.printable import format_time, printable
 from multidrop.recording import parse_size
 from multidrop.samples import MessageError, PolledUnits, SinkError, Spool, StoredMessage, unpack
 from multidrop.supervisor import supervisor
