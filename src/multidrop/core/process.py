@@ -16,7 +16,7 @@ from contextlib import suppress
 from contextvars import copy_context
 from functools import partial, wraps
 from queue import Empty, SimpleQueue
-from typing import Any, ParamSpec, Protocol, TypeVar
+from typing import Any, ParamSpec, Protocol, TypeVar, cast
 from weakref import WeakSet
 
 
@@ -62,41 +62,6 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-class _Act:
-    """A call that is carried out once, by the first thread that calls `run`."""
-
-    def __init__(self, act: Callable[[], Any]) -> None:
-        self._untaken = SimpleQueue[Callable[[], Any]]()
-        self._untaken.put(act)
-        self._outcome = SimpleQueue[tuple[Any, BaseException | None]]()
-
-    def run(self) -> None:
-        """Carry out the call, unless another thread has started it."""
-        try:
-            act = self._untaken.get_nowait()
-        except Empty:
-            return
-        try:
-            found = act()
-        except BaseException as failure:
-            self._outcome.put((None, failure))
-        else:
-            self._outcome.put((found, None))
-
-    def result(self) -> Any:
-        """Wait for the call; return its result or raise its exception."""
-        while True:
-            with suppress(Empty):
-                found, failure = self._outcome.get(timeout=HANDLING_S)
-                break
-        try:
-            if failure is not None:
-                raise failure
-            return found
-        finally:
-            del failure  # avoids a reference cycle: the exception's traceback refers to this frame
-
-
 def undisturbed(function: Callable[P, R]) -> Callable[P, R]:
     """Return a function that runs in a separate thread when the main thread calls it.
 
@@ -108,17 +73,37 @@ def undisturbed(function: Callable[P, R]) -> Callable[P, R]:
     def carry_out(*details: P.args, **more: P.kwargs) -> R:
         if threading.current_thread() is not threading.main_thread():
             return function(*details, **more)
-        work = _Act(partial(function, *details, **more))
+        untaken = [partial(function, *details, **more)]
+        outcome = SimpleQueue[tuple[Any, BaseException | None]]()
+
+        def work() -> None:
+            try:
+                act = untaken.pop()
+            except IndexError:  # another thread has started the call
+                return
+            try:
+                outcome.put((act(), None))
+            except BaseException as failure:
+                outcome.put((None, failure))
+
         thread = threading.Thread(
-            target=copy_context().run, args=(work.run,), name="multidrop undisturbed", daemon=True
+            target=copy_context().run, args=(work,), name="multidrop undisturbed", daemon=True
         )
         try:
             thread.start()
         except (RuntimeError, MemoryError):
-            work.run()
-        found: R = work.result()
+            work()
+        while True:
+            with suppress(Empty):
+                found, failure = outcome.get(timeout=HANDLING_S)
+                break
         if thread.is_alive():
             thread.join()
-        return found
+        try:
+            if failure is not None:
+                raise failure
+            return cast(R, found)
+        finally:
+            del failure  # avoids a reference cycle: the exception's traceback refers to this frame
 
     return carry_out
