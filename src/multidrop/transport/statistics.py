@@ -11,9 +11,9 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import accumulate, count
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
-from multidrop.core import DELAY_BUCKETS, EXCEPTION_STATUS, STATUSES, Counters, Peer, Status, delay_edge
+from multidrop.core import DELAY_BUCKETS, EXCEPTION_STATUS, STATUSES, Counters, Status, delay_edge
 from multidrop.transport import clock
 
 if TYPE_CHECKING:
@@ -192,8 +192,9 @@ class LineStatistics(Statistics):
     def since(self, earlier: LineStatistics) -> LineStatistics:
         """Return the statistics of the time since `earlier`, an earlier reading of this line.
 
-        An epoch is a number that changes at each reset. A line or drive whose epoch differs from that in
-        `earlier` was reset or replaced: it counts from zero.
+        An epoch is a number that changes at each reset. If the line's epoch differs from that in `earlier`,
+        the line was reset or replaced: it counts from zero. So does a drive whose epoch is not in `earlier`.
+        Drives without an epoch are identified by their names.
         """
         if self.epoch != earlier.epoch:
             return self
@@ -202,11 +203,9 @@ class LineStatistics(Statistics):
         if self.overruns is not None and earlier.overruns is not None:
             lost = self.overruns - earlier.overruns
         epochs = {name: drive.epoch for name, drive in self.drives.items()}
-        before = {
-            name: drive.counters for name, drive in earlier.drives.items() if epochs.get(name) == drive.epoch
-        }
+        before = {drive.epoch or name: drive.counters for name, drive in earlier.drives.items()}
         counters_by_drive = {
-            name: _difference(drive.counters, before.get(name, _NOTHING))
+            name: _difference(drive.counters, before.get(drive.epoch or name, _NOTHING))
             for name, drive in self.drives.items()
         }
         counted_s = None
@@ -279,46 +278,31 @@ def _middle(counters: Counters, bucket: int) -> float:
     return min((delay_edge(bucket) + most) / 2, counters.longest_ns) / 1e9
 
 
-class Count(NamedTuple):
-    """Statistics of a line since it was opened, and the C core's record of each drive, by drive name."""
-
-    statistics: LineStatistics
-    peers: Mapping[str, Peer]
-
-
 class LineMeter:
-    """Statistics of a line since it was opened or last reset; frozen when the line is closed.
-
-    At a reset, each drive's counts are kept with the C core's record of the drive, because another drive may
-    get the same name later.
-    """
+    """Statistics of a line since it was opened or last reset; frozen when the line is closed."""
 
     def __init__(self, exchanges: Exchanges) -> None:
         self._exchanges = exchanges
         self._opened_ns = clock.now_ns()
-        self._frozen: Count | None = None
-        self._reset_at = _begins(Count(line_statistics(0.0, {}, exchanges.line.overruns(), 0.0), {}))
+        self._frozen: LineStatistics | None = None
+        # the reading at the last reset, with an epoch of its own; all other readings have epoch 0
+        self._reset_at = _numbered(line_statistics(0.0, {}, exchanges.line.overruns(), 0.0))
 
     def read(self) -> LineStatistics:
-        now, reset_at = self._now(), self._reset_at
-        names = {peer: name for name, peer in reset_at.peers.items()}
-        before = {
-            name: reset_at.statistics.drives[names[peer]] for name, peer in now.peers.items() if peer in names
-        }
-        earlier = replace(reset_at.statistics, drives=before, epoch=now.statistics.epoch)
-        return replace(now.statistics.since(earlier), epoch=reset_at.statistics.epoch)
+        reset_at = self._reset_at
+        return replace(self._now().since(replace(reset_at, epoch=0)), epoch=reset_at.epoch)
 
     def reset(self) -> None:
-        self._reset_at = _begins(self._now())
+        self._reset_at = _numbered(self._now())
 
     def freeze(self, overruns: int | None) -> None:
         """Stop counting, because the line is closed; `overruns` is the final number of lost characters."""
         self._frozen = self._frozen or self._count(overruns)
 
-    def _now(self) -> Count:
+    def _now(self) -> LineStatistics:
         return self._frozen or self._count(self._exchanges.line.overruns())
 
-    def _count(self, overruns: int | None) -> Count:
+    def _count(self, overruns: int | None) -> LineStatistics:
         peers = {drive.name: peer for drive, peer in dict(self._exchanges.peers.present).items()}
         for _ in range(LOOKS):
             counters_by_drive = {name: peer.counters() for name, peer in peers.items()}
@@ -330,9 +314,9 @@ class LineMeter:
                 break
         seconds, counted_s = ((at_ns - self._opened_ns) / 1e9 for at_ns in (now_ns, counted_ns))
         epochs = {name: peer.number for name, peer in peers.items()}
-        return Count(line_statistics(seconds, counters_by_drive, overruns, counted_s, epochs), peers)
+        return line_statistics(seconds, counters_by_drive, overruns, counted_s, epochs)
 
 
-def _begins(reading: Count) -> Count:
+def _numbered(reading: LineStatistics) -> LineStatistics:
     """Return these statistics with a new epoch number, which shows that a line was opened or reset."""
-    return reading._replace(statistics=replace(reading.statistics, epoch=next(_EPOCHS)))
+    return replace(reading, epoch=next(_EPOCHS))
