@@ -15,44 +15,35 @@ CACHE_LINE = 64
 CHUNK_BYTES = 1 << 14
 
 
-class Chunk:
-    """A piece of memory for several structs of the C core."""
-
-    def __init__(self, size: int) -> None:
-        self.owner = ffi.new("uint8_t[]", size + CACHE_LINE)
-        self._next = int(ffi.cast("uintptr_t", self.owner))
-        self._next += -self._next % CACHE_LINE
-        self._end = self._next + size
-
-    def has_room(self, size: int) -> bool:
-        return self._next + size <= self._end
-
-    def take(self, kind: str, size: int) -> Any:
-        made = ffi.cast(f"{kind} *", self._next)
-        self._next += size
-        return made
-
-
 class Chunks:
     """Allocates structs in one chunk of memory after another."""
 
     def __init__(self) -> None:
         self._lock = Lock()
-        self._present = Chunk(0)
+        self._owner, self._next, self._end = _new_chunk(0)
 
     def take(self, kind: str) -> tuple[Any, Any]:
         """Return a pointer to a new struct of this C type, all zero, and the object that owns its memory."""
         size = -(-ffi.sizeof(kind) // CACHE_LINE) * CACHE_LINE
         # the lock is held by another thread, or by code that a signal has interrupted
         if not self._lock.acquire(blocking=False):
-            chunk = Chunk(size)
-            return chunk.take(kind, size), chunk.owner
+            owner, at, _ = _new_chunk(size)
+            return ffi.cast(f"{kind} *", at), owner
         try:
-            if not self._present.has_room(size):
-                self._present = Chunk(max(size, CHUNK_BYTES))
-            return self._present.take(kind, size), self._present.owner
+            if self._next + size > self._end:
+                self._owner, self._next, self._end = _new_chunk(max(size, CHUNK_BYTES))
+            at, self._next = self._next, self._next + size
+            return ffi.cast(f"{kind} *", at), self._owner
         finally:
             self._lock.release()
+
+
+def _new_chunk(size: int) -> tuple[Any, int, int]:
+    """Return the owner of a new chunk of memory, and the addresses of its start and its end."""
+    owner = ffi.new("uint8_t[]", size + CACHE_LINE)
+    start = int(ffi.cast("uintptr_t", owner))
+    start += -start % CACHE_LINE
+    return owner, start, start + size
 
 
 _chunks = Chunks()
