@@ -21,7 +21,7 @@ from multidrop.drive import Drive
 from multidrop.families import MODELS
 from multidrop.planning.blocks import planned
 from multidrop.planning.prediction import predict
-from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
+from multidrop.plant.model import Plant, PlantLine, PolledDrive
 from multidrop.poller import Poller
 from multidrop.polling.batch import Batch
 from multidrop.transport.line import Line
@@ -51,12 +51,7 @@ def _polling_drives(lines: Mapping[str, Sequence[Drive]], every: float | None) -
         PlantLine(
             port,
             port,
-            None,
-            None,
-            tuple(
-                PolledDrive(drive, tuple(Polled(register, every) for register in drive.readings()))
-                for drive in drives
-            ),
+            drives=[PolledDrive(drive, every=every) for drive in drives],
         )
         for port, drives in lines.items()
     )

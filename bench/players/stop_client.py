@@ -90,7 +90,7 @@ def polled(stack: ExitStack, ports: Sequence[str], drives: Sequence[Sequence[Dri
     lines = []
     for port, found in zip(ports, drives, strict=True):
         asked = [PolledDrive(each, tuple(Polled(reg, None) for reg in each.readings()[:2])) for each in found]
-        lines.append(PlantLine(port, port, None, None, tuple(asked)))
+        lines.append(PlantLine(port, port, drives=tuple(asked)))
     return list(stack.enter_context(Poller(Plant(tuple(lines), Path("plant.toml")))).buses.values())
 
 

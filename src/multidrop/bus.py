@@ -6,7 +6,7 @@ import logging
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 from multidrop.control.call import Latches, check_expiry
 from multidrop.control.eeprom_ledger import Ledger
@@ -16,7 +16,16 @@ from multidrop.control.performer import Broadcaster, BusLink, Performer
 from multidrop.control.records import AuditLog, WriteRecords
 from multidrop.control.stops import Stopper, StopRun
 from multidrop.control.writer import Writer
-from multidrop.core import RS485, Echo, Mastership, Peer, TransactionIds
+from multidrop.core import (
+    RS485,
+    Echo,
+    EchoMode,
+    Mastership,
+    Peer,
+    RS485Mode,
+    TransactionIds,
+    TransactionMode,
+)
 from multidrop.core.process import register_at_fork, undisturbed
 from multidrop.drive.family import Drive, check_drive
 from multidrop.drive.register import Register
@@ -29,10 +38,6 @@ from multidrop.transport.line import Line
 from multidrop.transport.statistics import LineMeter, LineStatistics
 
 D = TypeVar("D", bound=Drive)
-
-EchoMode = Echo | Literal["auto", "on", "off"]
-TransactionMode = TransactionIds | Literal["match", "ignore"]
-RS485Mode = RS485 | Literal["off", "kernel", "rts-up", "rts-down"]
 
 EXPIRY = 1.0  # s; default time limit for sending a write
 

@@ -454,6 +454,10 @@ class Poller(RowSource):
         except ValueError as unknown:
             raise KeyError(str(unknown)) from None
 
+    def __contains__(self, name: object) -> bool:
+        """Return True if a polled drive has this name."""
+        return any(drive.name == name for bus in self.buses.values() for drive in bus.drives)
+
     @property
     def buses(self) -> dict[str, Bus]:
         """The lines' buses, by name."""

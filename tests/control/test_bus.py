@@ -297,8 +297,8 @@ MISTAKES: dict[type[Exception], list[tuple[Callable[[Bus, Any], Any], str]]] = {
             "PlantLine takes drives as a list of PolledDrive objects, not [<Rig",
         ),
         (
-            lambda bus, rig: PlantLine("a", "/dev/a", cast(Any, [PolledDrive(rig)])),
-            "a line's baud rate is a whole number, not [PolledDrive(",
+            lambda bus, rig: PlantLine("a", "/dev/a", baudrate=cast(Any, "9600")),
+            "a line's baud rate is a whole number, not '9600'",
         ),
         (
             lambda bus, rig: PolledDrive(cast(Any, Rig)),

@@ -400,7 +400,7 @@ def test_a_value_is_multiplied_by_the_power_in_its_scale_register(
     sim["power"] = power
     sim["level"] = value
     assert sim["level"] == value or abs(raw) > 2**50
-    known = RegisterLookup(PlantLine("hall", "none", 9600, "8N1", (PolledDrive(family(1), ()),)))
+    known = RegisterLookup(PlantLine("hall", "none", drives=[PolledDrive(family(1), ())]))
     places = known.find(Framing.RTU, Message(1, 4, start, stop - start)).places
     assert [place.at for place in places if place.name == "level"] == [10 - start]
     apart = known.find(Framing.RTU, Message(1, 4, 10, size // 2)).places

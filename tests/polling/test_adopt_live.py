@@ -202,7 +202,7 @@ def test_no_stop_of_the_old_family_is_sent_after_a_family_change(both: TwoLines)
         other = polled(Other(1, name="pump-1"), [Other.registers["status"]], 0.02)
         yard = both.yard()
         reopened = PlantLine(
-            "yard", yard.port, None, None, (polled(Other(1, name="fan-1"), [], None),), echo="off"
+            "yard", yard.port, drives=(polled(Other(1, name="fan-1"), [], None),), echo="off"
         )
         poller.adopt(plant(line(both.hall().port, other, quick("pump-2", 2), name="hall"), reopened))
         assert writes == []

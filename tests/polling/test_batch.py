@@ -259,7 +259,7 @@ def test_a_plant_can_be_built_without_a_file() -> None:
     fan = Toy(2, name="fan")
     made = Plant([PlantLine("hall", "/dev/ttyUSB0", drives=[PolledDrive(fan, every=0.5)])])
     assert made == Plant(
-        (PlantLine("hall", "/dev/ttyUSB0", None, None, (PolledDrive(fan, made.lines[0].drives[0].polls),)),)
+        (PlantLine("hall", "/dev/ttyUSB0", drives=(PolledDrive(fan, made.lines[0].drives[0].polls),)),)
     )
     assert [poll.register for poll in made.lines[0].drives[0].polls] == list(fan.readings())
 

@@ -671,7 +671,7 @@ from multidrop.plant.model import PlantLine, Polled, PolledDrive
 _, slave = os.openpty()
 drives = [InnovertIBD(address, name=f"drive-{address}") for address in range(1, 32)]
 polled = tuple(PolledDrive(each, tuple(Polled(r, None) for r in each.readings())) for each in drives)
-plant = Plant((PlantLine("hall", os.ttyname(slave), None, None, polled),), Path())
+plant = Plant((PlantLine("hall", os.ttyname(slave), drives=polled),), Path())
 with tempfile.TemporaryDirectory() as folder, Poller(plant) as poller:
     with open_writer(Path(folder, "run.arrows"), plant.metadata()) as out:
         for batch in poller.batches(2.0):

@@ -211,7 +211,7 @@ def test_a_refused_register_is_skipped_and_its_neighbours_are_polled() -> None:
     with Simulator([Wire([Picky(Toy(1), {REFUSED.address})], unpaced=True)]) as simulator:
         drive = Toy(1, name="pump-1")
         polls = tuple(Polled(drive.register(name), None) for name in POLLED)
-        line = PlantLine("hall-1", simulator.wires[0].path, None, None, (PolledDrive(drive, polls),))
+        line = PlantLine("hall-1", simulator.wires[0].path, drives=(PolledDrive(drive, polls),))
         seen: dict[str, int] = {}
         refused = 0
         with Poller(Plant((line,), Path("hall.toml"))) as poller:

@@ -68,7 +68,7 @@ def poll(job: Job) -> dict[str, Any]:
     def line(port: str) -> PlantLine:
         drives = [Played(at, name=f"{port}/{at}", baudrate=BAUDRATE) for at in range(1, DRIVES + 1)]
         polled = tuple(PolledDrive(each, tuple(Polled(r, None) for r in each.readings())) for each in drives)
-        return PlantLine(port, port, None, None, polled)
+        return PlantLine(port, port, drives=polled)
 
     plant = Plant(tuple(line(port) for port in job.ports), Path())
     with names[1](plant) as poller, ExitStack() as stack:

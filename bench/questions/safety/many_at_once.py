@@ -53,7 +53,7 @@ def plant(ports: Sequence[str], drives: int) -> Plant:
         motor = YD1000(drives, name=f"{plants.MOTOR}-{number}")
         polled = [PolledDrive(each, tuple(Polled(reg, None) for reg in each.readings())) for each in found]
         polled.append(PolledDrive(motor, (Polled(YD1000.register("status"), 1.0),)))
-        lines.append(PlantLine(f"line-{number}", port, None, None, tuple(polled)))
+        lines.append(PlantLine(f"line-{number}", port, drives=tuple(polled)))
     return Plant(tuple(lines), Path("plant.toml"))
 
 

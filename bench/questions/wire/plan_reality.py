@@ -70,7 +70,7 @@ def exchanges(wanted: Wanted) -> list[Planned]:
 def case(name: str, port: str, wanted: Wanted, seconds: float) -> Case:
     """Poll a line; return the predicted and measured cycles of the drives that are polled without a rate."""
     drives = tuple(PolledDrive(drive, polls(drive, every)) for drive, every in wanted)
-    plant = Plant((PlantLine("line", port, None, None, drives),), Path("plant.toml"))
+    plant = Plant((PlantLine("line", port, drives=drives),), Path("plant.toml"))
     watched = next(drive for drive, every in wanted if every is None)
     first = watched.readings()[0].name
     with Poller(plant) as poller:

@@ -359,7 +359,7 @@ class _LineStop:
     def _run(self) -> None:
         line = self.line
         with Bus(
-            line.port, echo=line.echo, transaction=line.ids, rs485=line.rs485, audit=self.audit
+            line.port, echo=line.echo, transaction=line.transaction, rs485=line.rs485, audit=self.audit
         ) as self.bus:
             for polled in line.drives:
                 self.bus.attach(polled.drive)

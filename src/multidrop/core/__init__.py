@@ -61,10 +61,13 @@ from multidrop.core.port import REFUSALS as REFUSALS
 from multidrop.core.port import RS485 as RS485
 from multidrop.core.port import WHY_NOT_NICE as WHY_NOT_NICE
 from multidrop.core.port import Echo as Echo
+from multidrop.core.port import EchoMode as EchoMode
 from multidrop.core.port import Port as Port
 from multidrop.core.port import Realtime as Realtime
 from multidrop.core.port import RowQueue as RowQueue
+from multidrop.core.port import RS485Mode as RS485Mode
 from multidrop.core.port import TransactionIds as TransactionIds
+from multidrop.core.port import TransactionMode as TransactionMode
 from multidrop.core.port import Transactions as Transactions
 from multidrop.core.port import close_behind as close_behind
 from multidrop.core.port import get_settings as get_settings

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from enum import IntEnum, StrEnum
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 from weakref import finalize
 
 from multidrop._core import ffi, lib
@@ -94,6 +94,9 @@ class Echo(StrEnum):
         raise ValueError(f'echo {value!r} is none of "auto", "on" and "off"')
 
 
+EchoMode = Echo | Literal["auto", "on", "off"]
+
+
 class RS485(StrEnum):
     """The party that switches the transceiver between receiving and sending.
 
@@ -118,6 +121,9 @@ class RS485(StrEnum):
             )
 
 
+RS485Mode = RS485 | Literal["off", "kernel", "rts-up", "rts-down"]
+
+
 class TransactionIds(StrEnum):
     """A gateway's transaction ids: `MATCH` if a reply has the id of its request, `IGNORE` if not."""
 
@@ -127,6 +133,9 @@ class TransactionIds(StrEnum):
     @classmethod
     def _missing_(cls, value: object) -> TransactionIds:
         raise ValueError(f'transaction {value!r} is none of "match" and "ignore"')
+
+
+TransactionMode = TransactionIds | Literal["match", "ignore"]
 
 
 class Transactions(IntEnum):

@@ -158,6 +158,10 @@ class Register(Generic[T]):
     def __str__(self) -> str:
         return self.name
 
+    def __repr__(self) -> str:
+        unit = f", {self.unit}" if self.unit else ""
+        return f"<Register {self.name}: {self.access.value}, {self.table.name} {self.address}{unit}>"
+
     @property
     def title(self) -> str:
         """The English title: the register's name with spaces instead of underscores."""

@@ -236,7 +236,7 @@ def _line(table: Any, place: TomlPlace) -> PlantLine | None:
     echo = place.attempt(Echo, given.get("echo", "auto"), key="echo")
     rs485 = place.attempt(RS485, given.get("rs485", "off"), key="rs485") or RS485.OFF
     place.attempt(rs485.check_port, port, key="rs485")
-    ids = place.attempt(TransactionIds, given.get("transaction", "match"), key="transaction")
+    transaction = place.attempt(TransactionIds, given.get("transaction", "match"), key="transaction")
     if "transaction" in given and not speaks_tcp(port):
         place.wrong(f"transaction is only for tcp:// ports, and {port} is not one; remove it", "transaction")
     is_right = len(place.config_errors) == before
@@ -252,7 +252,7 @@ def _line(table: Any, place: TomlPlace) -> PlantLine | None:
         drives=polled,
         switching=switching or 0.0,
         echo=echo or Echo.AUTO,
-        ids=ids or TransactionIds.MATCH,
+        transaction=transaction or TransactionIds.MATCH,
         rs485=rs485,
         settle=settle or 0.0,
     )
@@ -368,25 +368,17 @@ def _try_each(
 
 def _polls(
     entries: list[Any] | None, model: type[Drive], every: float | None, place: TomlPlace
-) -> tuple[Polled, ...]:
+) -> list[Polled]:
     if entries is None:
         if not model.readings():
             place.wrong(f"{model.title or model.__name__} has no readings; add poll = [...] with registers")
-        return tuple(Polled(register, every) for register in model.readings())
-    found = [_polled(entry, model, every, at) for entry, at in place.inside("poll", entries)]
-    named = {polled.register for polled in found if isinstance(polled, Polled)}
-    return tuple(
-        polled
-        for one in found
-        for polled in (one if isinstance(one, tuple) else (one,))
-        if polled is not None and (one is polled or polled.register not in named)
-    )
+        return [Polled("*", every)]
+    found = (_polled(entry, model, every, at) for entry, at in place.inside("poll", entries))
+    return list(filter(None, found))
 
 
-def _polled(
-    entry: Any, model: type[Drive], every: float | None, place: TomlPlace
-) -> Polled | tuple[Polled, ...] | None:
-    """Return the polls of an entry in the list `poll`: all readings for "*"; None if the entry is invalid."""
+def _polled(entry: Any, model: type[Drive], every: float | None, place: TomlPlace) -> Polled | None:
+    """Return an entry of the list `poll`, which is a register or "*"; None if the entry is invalid."""
     if not isinstance(entry, (str, dict)):
         place.wrong(f'{entry!r} is not right; write "output_current" or {{ register = "output_current" }}')
         return None
@@ -394,7 +386,7 @@ def _polled(
     own = duration_of(given, "every", place) if "every" in given else every
     if given.get("register") == "*":
         place.once(place.steps[:-1], "*", sentence='"*" is in poll twice; remove one')
-        return tuple(Polled(register, own) for register in model.readings())
+        return Polled("*", own)
     register = (
         place.attempt(model.register, given["register"], key="register") if "register" in given else None
     )

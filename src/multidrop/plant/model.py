@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field, replace
 from enum import Flag
 from importlib import import_module
 from itertools import product
@@ -14,7 +14,7 @@ from unicodedata import normalize
 
 import multidrop
 from multidrop.channels import Channel, DriveSeries
-from multidrop.core import RS485, Echo, TransactionIds
+from multidrop.core import RS485, Echo, EchoMode, RS485Mode, TransactionIds, TransactionMode
 from multidrop.drive.family import Drive, verbs_of
 from multidrop.drive.line_settings import check_port
 from multidrop.drive.register import Register
@@ -53,29 +53,32 @@ FLEET_KEYS: Final = {"may": Key(dict, "[fleet.may], a table", keywords=json_sche
 T = TypeVar("T")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, init=False)
 class Polled:
     """A register that is read every `every` seconds; None means as fast as the line allows.
 
+    A PolledDrive replaces a name by the drive's register, and "*" by all readings without an own entry.
     Raises ValueError unless `every` is None or from 0.0001 to 86400 s.
     """
 
     register: Register[Any]
-    every: float | None = None
+    every: float | None
 
-    def __post_init__(self) -> None:
-        if self.every is not None:
-            check_period(self.every)
+    def __init__(self, register: Register[Any] | str, every: float | None = None) -> None:
+        if every is not None:
+            check_period(every)
+        object.__setattr__(self, "register", register)
+        object.__setattr__(self, "every", every)
 
 
 @dataclass(frozen=True, init=False)
 class PolledDrive:
     """A drive and its polled registers, each with its period.
 
-    `polls` lists registers of the drive, their names, or Polled objects for registers with their own period.
-    Without `polls`, all readings of the drive are polled. `every` is the period in s of registers without
-    their own; None means as fast as the line allows. `channels` are computed from registers of this drive and
-    of others.
+    `poll` lists registers of the drive, their names, or Polled objects for registers with their own period.
+    "*" stands for all readings that have no other entry. Without `poll`, all readings are polled. `every` is
+    the period in s of registers without their own; None means as fast as the line allows. `channels` are
+    computed from registers of this drive and of others.
     """
 
     drive: Drive
@@ -85,20 +88,21 @@ class PolledDrive:
     def __init__(
         self,
         drive: Drive,
-        polls: Iterable[Polled | Register[Any] | str] | None = None,
+        poll: Iterable[Polled | Register[Any] | str] | None = None,
         *,
         every: float | None = None,
         channels: Iterable[Channel] = (),
     ) -> None:
         if not isinstance(drive, Drive):
             raise TypeError(f"PolledDrive takes a drive such as YD1000(1), not {drive!r}")
-        if isinstance(polls, (str, Register, Polled)):
+        if isinstance(poll, (str, Register, Polled)):
             raise TypeError(
                 "PolledDrive takes a list of registers, such as ['output_current'], not a single register"
             )
-        wanted = drive.readings() if polls is None else polls
+        wanted = ["*"] if poll is None else poll
+        entries = [one if isinstance(one, Polled) else Polled(one, every) for one in wanted]
         object.__setattr__(self, "drive", drive)
-        object.__setattr__(self, "polls", tuple(_polled(drive, one, every) for one in wanted))
+        object.__setattr__(self, "polls", tuple(_polls(drive, entries)))
         object.__setattr__(self, "channels", tuple(channels))
 
     def __hash__(self) -> int:  # the polls are not hashed, because the hash is computed often
@@ -136,10 +140,19 @@ class PolledDrive:
         return next(found, None) or self.drive.register(name)
 
 
-def _polled(drive: Drive, wanted: Polled | Register[Any] | str, every: float | None) -> Polled:
-    if isinstance(wanted, Polled):
-        return wanted
-    return Polled(drive.register(wanted) if isinstance(wanted, str) else wanted, every)
+def _polls(drive: Drive, given: Iterable[Polled]) -> Iterator[Polled]:
+    """Yield the polled registers of the entries `given`: see PolledDrive."""
+
+    def known(name: Register[Any] | str) -> Register[Any] | str:
+        return drive.register(name) if isinstance(name, str) and name != "*" else name
+
+    entries = [(known(poll.register), poll.every) for poll in given]
+    named = {register for register, _ in entries}
+    for register, every in entries:
+        if isinstance(register, str):  # "*"
+            yield from (Polled(one, every) for one in drive.readings() if one not in named)
+        else:
+            yield Polled(register, every)
 
 
 def _all_of(kind: type[T], given: Iterable[T], owner: str, name: str) -> tuple[T, ...]:
@@ -156,18 +169,22 @@ class PlantLine:
 
     name: str
     port: str
+    _: KW_ONLY
     baudrate: int | None = None
     format: str | None = None
     drives: Sequence[PolledDrive] = ()  # converted to a tuple
     switching: float = 0.0  # seconds that the port takes to change baud rate or format
-    echo: Echo = Echo.AUTO
-    ids: TransactionIds = TransactionIds.MATCH
-    rs485: RS485 = RS485.OFF
+    echo: EchoMode = Echo.AUTO
+    transaction: TransactionMode = TransactionIds.MATCH
+    rs485: RS485Mode = RS485.OFF
     settle: float = 0.0  # seconds of silence after the port is opened
 
     def __post_init__(self) -> None:
         if self.baudrate is not None and not is_whole(self.baudrate):
             raise TypeError(f"a line's baud rate is a whole number, not {self.baudrate!r}")
+        object.__setattr__(self, "echo", Echo(self.echo))
+        object.__setattr__(self, "transaction", TransactionIds(self.transaction))
+        object.__setattr__(self, "rs485", RS485(self.rs485))
         object.__setattr__(self, "drives", _all_of(PolledDrive, self.drives, "PlantLine", "drives"))
 
     def at(self, port: str) -> PlantLine:
@@ -175,7 +192,7 @@ class PlantLine:
         return replace(self, port=port, rs485=RS485.OFF if "://" in port else self.rs485)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Plant:
     """All lines of a plant file, and its table `serve`, which only the gateway uses and checks.
 
@@ -192,6 +209,10 @@ class Plant:
         if isinstance(self.lines, (str, Path)):
             raise TypeError(f"Plant takes lines; to load a plant file, write Plant.load({str(self.lines)!r})")
         object.__setattr__(self, "lines", _all_of(PlantLine, self.lines, "Plant", "lines"))
+
+    def __repr__(self) -> str:
+        lines = ", ".join(f"{line.name}: {len(line.drives)} drives" for line in self.lines)
+        return f"<Plant {self.path}; {lines or 'no lines'}>"
 
     @classmethod
     def load(cls, path: Path | str) -> Plant:

@@ -307,7 +307,7 @@ def _is_free(drive: Drive, buses: set[Bus]) -> bool:
 def _can_become(line: PolledLine, wanted: PlantLine) -> bool:
     """Return True if the line can become the line `wanted` without reopening its port."""
     facts, others = (
-        (each.port, each.echo, each.ids, each.rs485, each.settle) for each in (line.declared, wanted)
+        (each.port, each.echo, each.transaction, each.rs485, each.settle) for each in (line.declared, wanted)
     )
     settings = line.bus.line.only_settings
     wanted_settings = {(at.baudrate, at.format) for at in (polled.drive.settings for polled in wanted.drives)}

@@ -153,7 +153,7 @@ class LineSet:
         return make(
             line.port,
             echo=line.echo,
-            transaction=line.ids,
+            transaction=line.transaction,
             rs485=line.rs485,
             settle=line.settle,
             ledger=self._ledger,

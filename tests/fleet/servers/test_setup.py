@@ -337,7 +337,7 @@ def lines_again(path: Path, folder: Path) -> list[Any]:
 
 def as_text(line: Any) -> str:
     return repr(
-        [line.name, line.port, line.baudrate, line.format, line.switching, line.echo, line.ids]
+        [line.name, line.port, line.baudrate, line.format, line.switching, line.echo, line.transaction]
     ) + repr(
         [
             (

@@ -249,7 +249,7 @@ def plant_with(unit: str, folder: Path) -> Plant:
     """Return a plant whose drive has a register `load` in this unit."""
     drive = type("Meter", (type(PUMP),), {"load": reading(0x9000, unit, step=0.1)})(1, name="pump-1")
     polled = PolledDrive(drive, (Polled(drive.load, 1.0),))
-    return Plant((PlantLine("hall", "/dev/null", None, None, (polled,)),), folder / "plant.toml")
+    return Plant((PlantLine("hall", "/dev/null", drives=(polled,)),), folder / "plant.toml")
 
 
 def batch_at(time_ns: int) -> Any:

@@ -117,7 +117,7 @@ def plant_of(*drives: tuple[str, Drive], polled: bool = True) -> Plant:
         lines.setdefault(line, []).append(
             PolledDrive(drive, tuple(Polled(register, None) for register in registers))
         )
-    made = [PlantLine(name, f"/dev/{name}", None, None, tuple(found)) for name, found in lines.items()]
+    made = [PlantLine(name, f"/dev/{name}", drives=tuple(found)) for name, found in lines.items()]
     return Plant(tuple(made), Path("plant.toml"))
 
 

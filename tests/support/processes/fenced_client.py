@@ -50,7 +50,7 @@ def live(
         PolledDrive(Counted(1, name=f"drive-{n}"), (Polled(Counted.number, None),)) for n in range(len(ports))
     ]
     lines = [
-        PlantLine(f"line-{n}", port, None, None, (drive,))
+        PlantLine(f"line-{n}", port, drives=(drive,))
         for n, (port, drive) in enumerate(zip(ports, drives, strict=True))
     ]
     with Poller(Plant(tuple(lines), Path("plant.toml")), mastership=mastership) as poller:

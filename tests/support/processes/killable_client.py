@@ -66,7 +66,7 @@ def poll(port: str, directory: Path, life: str, number: int) -> None:
     log = (directory / f"{life}.told").open("wb", buffering=0)
     drive = Counted(1, name=NAME)
     polled = PolledDrive(drive, (Polled(Counted.count, None),))
-    plant = Plant((PlantLine("line", port, None, None, (polled,)),), directory / "plant.toml")
+    plant = Plant((PlantLine("line", port, drives=(polled,)),), directory / "plant.toml")
     writers = [open_writer(directory / f"{life}{suffix}", METADATA) for suffix in (".arrows", ".csv")]
     log.write(b"rows 0\n")
     with Poller(plant, ledger=ledger(directory), audit=audit(directory)) as poller:

@@ -263,7 +263,7 @@ def inside(folder: Path, fan: Drive = FAN) -> Any:
     """Return a PartContext for a gateway part: two drives, a fake hub and fake commands."""
     polls = tuple(Polled(register, 1.0) for register in (PUMP.output_frequency, PUMP.status))
     drives = tuple(PolledDrive(drive, polls) for drive in (PUMP, fan))
-    plant = Plant((PlantLine("hall", "/dev/null", None, None, drives),), folder / "plant.toml")
+    plant = Plant((PlantLine("hall", "/dev/null", drives=drives),), folder / "plant.toml")
     hub: Any = ScriptedHub(fan.name)
     commands: Any = RecordedCommands()
     ask: Any = SimpleNamespace()

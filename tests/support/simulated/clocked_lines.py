@@ -294,7 +294,7 @@ class ClockedLines:
         wire.open()
         name = wire.where if speaks_tcp(wire.where) else "test line"
         declared = line(name, *drives)
-        self._begin({name: wire}, plant(replace(declared, ids=wire.ids)))
+        self._begin({name: wire}, plant(replace(declared, transaction=wire.ids)))
 
     @classmethod
     def of_lines(cls, wires: Mapping[str, ClockedWire], polled: Plant) -> ClockedLines:

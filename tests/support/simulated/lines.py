@@ -120,7 +120,7 @@ def polled(drive: Drive, registers: Iterable[Register[Any]], every: float | None
 
 
 def line(port: str, *drives: PolledDrive, name: str = "line") -> PlantLine:
-    return PlantLine(name, port, None, None, drives)
+    return PlantLine(name, port, drives=drives)
 
 
 def plant(*lines: PlantLine) -> Plant:

@@ -172,7 +172,7 @@ def opening_of(arguments: argparse.Namespace, line: PlantLine | None) -> tuple[R
             raise ValueError(
                 f"--{name} cannot be used with a plant file. Write key {name!r} in the table of {line.name!r}"
             )
-    return line.rs485, line.settle
+    return RS485(line.rs485), line.settle
 
 
 def plant_at(arguments: argparse.Namespace) -> Plant | None:
@@ -328,9 +328,8 @@ def _by_plant(arguments: argparse.Namespace) -> Target:
     line, drive = plant.find_drive(name)
     ports = [f"--port={name}={port}" for name, port in arguments.ports]
     words = (path, drive.name, *ports)
-    return Target(
-        drive, line.port, line.echo, line.rs485, line.settle, words, command_line((path, drive.name))
-    )
+    echo, rs485 = Echo(line.echo), RS485(line.rs485)
+    return Target(drive, line.port, echo, rs485, line.settle, words, command_line((path, drive.name)))
 
 
 def _by_port(arguments: argparse.Namespace) -> Target:
