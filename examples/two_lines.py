@@ -7,7 +7,7 @@ from collections import Counter
 
 from simulated_plant import simulated_plant
 
-from multidrop import Polled, PolledDrive, Poller
+from multidrop import Poller
 
 PLANT = """
 [[line]]
@@ -46,7 +46,7 @@ def main(seconds: float) -> None:
             samples.update(row.drive for row in batch if row.status == "ok")
             if number == 2:  # add pump-2 again after the third batch
                 pump = plant.lines[0].drives[1].drive
-                poller.add("hall-1", PolledDrive(pump, (Polled(pump.register("output_current"), None),)))
+                poller.add("hall-1", pump, poll=["output_current"])
         lines = poller.statistics()
     for drive, count in sorted(samples.items()):
         print(f"{drive}: {count} samples")

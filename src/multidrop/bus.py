@@ -426,9 +426,9 @@ class Bus:
 def _made(drive: D | type[D], address: int | None, line: dict[str, Any], details: dict[str, Any]) -> D:
     """Return `drive`; if it is a class, create a drive of that class.
 
-    `line` and `details` are options of the new drive; `details` override `line`. Raises TypeError if `drive`
-    is neither a drive nor a class of drives, if the address is missing, or if details are given for an
-    existing drive.
+    `line` has the settings of the line, and `details` the options of the new drive, which override `line`.
+    Raises TypeError if `drive` is neither a drive nor a class of drives, if the address is missing, or if
+    details are given for an existing drive.
     """
     family = drive if isinstance(drive, type) else type(drive)
     if not issubclass(family, Drive):
@@ -441,6 +441,7 @@ def _made(drive: D | type[D], address: int | None, line: dict[str, Any], details
         raise TypeError(
             f"attach takes no address or options with a drive object; write them in {family.__name__}(…)"
         )
+    drive.take_settings(**line)
     return drive
 
 

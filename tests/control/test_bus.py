@@ -146,7 +146,8 @@ def test_a_drive_uses_the_line_settings_of_the_bus_by_default() -> None:
     with unpaced(simulated(Toy(1))) as sim, Bus(path(sim), baudrate=19200, format="8N2") as bus:
         assert str(bus.attach(Toy, 1).settings) == "19200 8N2"
         assert str(bus.attach(Toy, 2, baudrate=9600).settings) == "9600 8N2"
-        assert str(bus.attach(Toy(3)).settings) == "9600 8N1"
+        assert str(bus.attach(Toy(3)).settings) == "19200 8N2"
+        assert str(bus.attach(Toy(4, format="8E1")).settings) == "19200 8E1"
 
 
 def test_a_drive_cannot_be_attached_to_a_closed_bus() -> None:

@@ -24,7 +24,7 @@ from recordings import SCHEMA, row, rows_of
 from tables import table
 from toy import Toy
 
-from multidrop.core import Columns, Names, RowQueue, Status
+from multidrop.core import RS485, Columns, Echo, Names, RowQueue, Status, TransactionIds
 from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
 from multidrop.poller import Poller
 from multidrop.polling.batch import ROW_COLUMNS, Batch, Row
@@ -245,6 +245,8 @@ def test_a_drive_is_found_by_its_name(poller: Poller) -> None:
     assert poller["pump-1"] is poller.bus("line").drives[0]
     with pytest.raises(KeyError, match="did you mean pump-1"):
         poller["pump-11"]
+    assert "pump-1" in poller
+    assert "pump-11" not in poller
 
 
 def test_the_poll_list_of_an_added_drive_may_contain_names(poller: Poller) -> None:
@@ -262,6 +264,33 @@ def test_a_plant_can_be_built_without_a_file() -> None:
         (PlantLine("hall", "/dev/ttyUSB0", drives=(PolledDrive(fan, made.lines[0].drives[0].polls),)),)
     )
     assert [poll.register for poll in made.lines[0].drives[0].polls] == list(fan.readings())
+
+
+def test_a_star_in_python_polls_all_readings_that_have_no_other_entry() -> None:
+    polled = PolledDrive(Toy(2), poll=["*", Polled("status", every=10.0)], every=0.5)
+    others = [reading for reading in Toy.readings() if reading is not Toy.status]
+    assert polled.polls == (*(Polled(one, 0.5) for one in others), Polled(Toy.status, 10.0))
+
+
+def test_a_line_in_python_takes_the_values_of_a_plant_file_as_texts() -> None:
+    line = PlantLine("hall", "/dev/ttyUSB0", echo="off", transaction="ignore", rs485="rts-up")
+    assert (line.echo, line.transaction, line.rs485) == (Echo.OFF, TransactionIds.IGNORE, RS485.RTS_UP)
+    with pytest.raises(ValueError, match=r'rs485 \'up\' is none of "off", "kernel", "rts-up" and "rts-down"'):
+        PlantLine("hall", "/dev/ttyUSB0", rs485=cast(Any, "up"))
+
+
+def test_a_line_in_python_gives_its_settings_to_drives_without_their_own() -> None:
+    drives = [PolledDrive(Toy(2)), PolledDrive(Toy(3, baudrate=9600))]
+    line = PlantLine("hall", "/dev/ttyUSB0", baudrate=19200, format="8E1", drives=drives)
+    assert [str(polled.drive.settings) for polled in line.drives] == ["19200 8E1", "9600 8E1"]
+    with pytest.raises(ValueError, match="baud rate 300 is not supported by TOY T1"):
+        PlantLine("hall", "/dev/ttyUSB0", baudrate=300, drives=[PolledDrive(Toy(4))])
+
+
+def test_the_repr_of_a_plant_shows_its_lines_and_the_number_of_drives() -> None:
+    made = Plant([PlantLine("hall", "/dev/ttyUSB0", drives=[PolledDrive(Toy(2), ["status"])])])
+    assert repr(made) == "<Plant plant; hall: 1 drives>"
+    assert repr(Toy.status) == "<Register status: reading, holding register 5>"
 
 
 def test_a_poller_can_be_created_from_a_plant_file(tmp_path: Path) -> None:

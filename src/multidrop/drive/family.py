@@ -17,7 +17,7 @@ from multidrop.drive.declaration_check import (
     request_errors,
     text_errors,
 )
-from multidrop.drive.line_settings import Settings, check_agreed_silence, framing_on
+from multidrop.drive.line_settings import Settings, check_agreed_silence, first_given, framing_on, supported
 from multidrop.drive.link import NO_LINK, Link, RegisterAccess
 from multidrop.drive.options import Option, checked_options, confirmation, doubt
 from multidrop.drive.parameters import Parameter, ParameterSpace
@@ -228,21 +228,11 @@ class Drive(RegisterAccess):
     ) -> None:
         if type(self) is Drive:
             raise TypeError("Drive is the base class: use a family, such as YD1000, or your own subclass")
-        self.address = self._one_of("address", address, self.addresses)
+        self.address = supported("address", address, self.addresses, self._kind())
         self.framing = self._framing(framing)
         self._declared_framing = None if framing is None else self.framing
-        formats = self.formats_in(self.framing)
-        self.settings = Settings(
-            self._one_of("baud rate", self.baudrates[0] if baudrate is None else baudrate, self.baudrates),
-            self._one_of("format", formats[0] if format is None else format, formats),
-        )
-        self.agreed_silence = silence
-        if silence is not None:
-            own = self._own_silence() if self.framing is Framing.RTU else None
-            check_agreed_silence(silence, self.settings, own)
-        self.response_delay = max(
-            self.response_delay, self.response_delay_characters * self.settings.character
-        )
+        self._given = (baudrate, format, silence)
+        self._use(*first_given(self._given, (self.baudrates[0], self.formats_in(self.framing)[0], None)))
         self.name = name or f"{self.model or type(self).__name__}@{address}"
         if not (isinstance(self.name, str) and self.name.isprintable()):  # a line break would split a row
             raise ValueError(f"the name {name!r} must be one line of printable characters")
@@ -252,18 +242,6 @@ class Drive(RegisterAccess):
         self.link: Link = NO_LINK
         # one item: the number of stops called so far, which the bus changes
         self.stops_called: Sequence[int] = (0,)
-
-    @classmethod
-    def _one_of(cls, what: str, value: Any, allowed: Any) -> Any:
-        # True and 1.0 equal 1 in Python, but are not valid here
-        if value in allowed and not isinstance(value, bool | float):
-            return value
-        choices = (
-            f"{allowed[0]} to {allowed[-1]}"
-            if isinstance(allowed, range)
-            else ", ".join(str(choice) for choice in allowed)
-        )
-        raise ValueError(f"{what} {value!r} is not supported by {cls._kind()}; choose {choices}")
 
     @classmethod
     def _framing(cls, framing: Framing | str | None) -> Framing:
@@ -298,6 +276,29 @@ class Drive(RegisterAccess):
             family=self._kind(),
             speaks_modbus=self.speaks(Framing.TCP),
         )
+
+    def take_settings(self, baudrate: int | None, format: str | None, silence: float | None = None) -> None:
+        """Use a line's settings for those that the drive was created without; None changes nothing.
+
+        Raises ValueError for a setting that the family does not support.
+        """
+        now = (self.settings.baudrate, self.settings.format, self.agreed_silence)
+        wanted = first_given(self._given, (baudrate, format, silence), now)
+        if wanted != now:
+            self._use(*wanted)
+
+    def _use(self, baudrate: int, format: str, silence: float | None) -> None:
+        self.settings = Settings(
+            supported("baud rate", baudrate, self.baudrates, self._kind()),
+            supported("format", format, self.formats_in(self.framing), self._kind()),
+        )
+        self.agreed_silence = silence
+        if silence is not None:
+            own = self._own_silence() if self.framing is Framing.RTU else None
+            check_agreed_silence(silence, self.settings, own)
+        if self.response_delay_characters:
+            least = self.response_delay_characters * self.settings.character
+            self.response_delay = max(type(self).response_delay, least)
 
     def needed_silence(self) -> float:
         """Return the silence in s that this drive needs before a request and after its reply."""

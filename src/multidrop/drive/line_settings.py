@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 from urllib.parse import SplitResult, urlsplit
 
 from multidrop.core import Framing
@@ -154,6 +156,20 @@ def framing_on(
             f"{SERIAL_ADDRESSES[0]} to {SERIAL_ADDRESSES[-1]}"
         )
     return wanted
+
+
+def first_given(*choices: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Return the first value at each place that is not None; None if there is none."""
+    return tuple(next((one for one in each if one is not None), None) for each in zip(*choices, strict=True))
+
+
+def supported(what: str, value: Any, allowed: Sequence[Any], family: str) -> Any:
+    """Return `value`. Raises ValueError if it is not among the values that a family allows."""
+    # True and 1.0 equal 1 in Python, but are not valid here
+    if value in allowed and not isinstance(value, bool | float):
+        return value
+    choices = f"{allowed[0]} to {allowed[-1]}" if isinstance(allowed, range) else ", ".join(map(str, allowed))
+    raise ValueError(f"{what} {value!r} is not supported by {family}; choose {choices}")
 
 
 def check_agreed_silence(agreed: float, settings: Settings, own: float | None) -> None:

@@ -165,7 +165,7 @@ def _all_of(kind: type[T], given: Iterable[T], owner: str, name: str) -> tuple[T
 
 @dataclass(frozen=True)
 class PlantLine:
-    """A port with its drives. The drives' settings already include the line's baud rate and format."""
+    """A port with its drives; the baud rate and format apply to drives that are created without their own."""
 
     name: str
     port: str
@@ -186,6 +186,8 @@ class PlantLine:
         object.__setattr__(self, "transaction", TransactionIds(self.transaction))
         object.__setattr__(self, "rs485", RS485(self.rs485))
         object.__setattr__(self, "drives", _all_of(PolledDrive, self.drives, "PlantLine", "drives"))
+        for polled in self.drives:
+            polled.drive.take_settings(self.baudrate, self.format)
 
     def at(self, port: str) -> PlantLine:
         """Return a copy of the line at another port, without `rs485` if the new port is a network port."""

@@ -204,6 +204,7 @@ class PolledLine:
         If another drive was removed from this address, first wait for the end of its last exchange. Only then
         is it known whether a late reply of that drive may still come.
         """
+        polled.drive.take_settings(self.declared.baudrate, self.declared.format)
         self.await_gone(polled.drive.address)
         # not under the lock, which polling needs: `require` may wait until a port is open
         settings = polled.drive.settings
