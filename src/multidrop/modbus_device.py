@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
-from typing import Literal
+from typing import Literal, overload
 
 from multidrop.core import Framing, NumberFormat
 from multidrop.drive import Drive
@@ -23,7 +23,9 @@ from multidrop.errors import (
 )
 from multidrop.printable import is_number, is_whole
 
-Format = Literal["U16", "I16", "I8", "U32", "I32", "U64", "I64", "F16", "F32", "F64", "BCD16", "BCD32"]
+IntegerFormat = Literal["U16", "I16", "I8", "U32", "I32", "U64", "I64", "BCD16", "BCD32"]
+FloatFormat = Literal["F16", "F32", "F64"]
+Format = IntegerFormat | FloatFormat
 Order = Literal["AB", "BA", "ABCD", "CDAB", "BADC", "DCBA"]
 
 _FORMATS = {each.name: each for each in WORDS if each is not NumberFormat.U32_EITHER}
@@ -47,9 +49,17 @@ class ModbusDevice(Drive):
     has_motor = False  # assumed: the user confirms for each write that it starts no motor
     response_timeout = 1.0
 
+    @overload
     def read_holding(
-        self, start: int, count: int = 1, format: Format = "U16", *, order: Order = "ABCD"
-    ) -> list[float]:
+        self, start: int, count: int = 1, *, format: IntegerFormat = "U16", order: Order = "ABCD"
+    ) -> list[int]: ...
+    @overload
+    def read_holding(
+        self, start: int, count: int = 1, *, format: FloatFormat, order: Order = "ABCD"
+    ) -> list[float]: ...
+    def read_holding(
+        self, start: int, count: int = 1, *, format: Format = "U16", order: Order = "ABCD"
+    ) -> list[int] | list[float]:
         """Return `count` numbers from the holding registers that start at address `start`.
 
         Raises NoReply, BadReply, DriveException or LineError if the read fails, and NoValue if a number is
@@ -57,9 +67,17 @@ class ModbusDevice(Drive):
         """
         return self._numbers(3, "holding register", start, count, format, order)
 
+    @overload
     def read_input(
-        self, start: int, count: int = 1, format: Format = "U16", *, order: Order = "ABCD"
-    ) -> list[float]:
+        self, start: int, count: int = 1, *, format: IntegerFormat = "U16", order: Order = "ABCD"
+    ) -> list[int]: ...
+    @overload
+    def read_input(
+        self, start: int, count: int = 1, *, format: FloatFormat, order: Order = "ABCD"
+    ) -> list[float]: ...
+    def read_input(
+        self, start: int, count: int = 1, *, format: Format = "U16", order: Order = "ABCD"
+    ) -> list[int] | list[float]:
         """Return `count` numbers from the input registers that start at address `start`.
 
         Raises the errors of `read_holding`.

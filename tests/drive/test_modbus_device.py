@@ -45,7 +45,7 @@ def test_modbus_device_reads_numbers_of_any_format(meter: BusAndDevice) -> None:
     assert device.read_holding(6, format="I16") == [-1]
     low, high = struct.unpack(">HH", struct.pack(">f", 2.5))
     sim["high"], sim["low"] = high, low
-    assert device.read_input(0, 1, "F32", order="CDAB") == [2.5]
+    assert device.read_input(0, 1, format="F32", order="CDAB") == [2.5]
     sim["high"], sim["low"] = 0x7FC0, 0
     with pytest.raises(NoValue, match="input register 0 holds no valid value"):
         device.read_input(0, format="F32")
@@ -184,7 +184,7 @@ def test_modbus_device_reads_many_registers_in_several_requests(meter: BusAndDev
     assert device.read_holding(0, 300) == [0] * 300
     assert [request.count for request, _ in line.frames] == [125, 125, 50]
     line.frames.clear()
-    assert device.read_holding(0, 70, "F64") == [0.0] * 70
+    assert device.read_holding(0, 70, format="F64") == [0.0] * 70
     assert [(request.start, request.count) for request, _ in line.frames] == [(0, 124), (124, 124), (248, 32)]
 
 

@@ -113,7 +113,7 @@ def test_dir_of_the_package_lists_only_its_few_public_names() -> None:
 def test_the_help_of_a_drive_method_shows_the_signature() -> None:
     shown = render_doc(multidrop.YD1000.start, renderer=plaintext)
     assert "start(self, direction: " in shown
-    assert str(signature(Toy(1).stop)) == "()"
+    assert str(signature(Toy(1).stop)) == "(*, seconds: 'float | None' = None)"
 
 
 def test_a_missing_port_is_reported_in_one_sentence() -> None:
@@ -131,18 +131,19 @@ ROOT = Path(__file__).parents[2]
 
 PAGES = [ROOT / "README.md", ROOT / "docs" / "howto" / "coming-from.md"]
 
+BLOCKS = [
+    (page, block)
+    for page in PAGES
+    for block in re.findall(r"```python\n(.*?)```", page.read_text("utf-8"), re.DOTALL)
+]
+
 SCRIPTS = {
-    **{
-        page.stem.replace("-", "_"): "".join(
-            re.findall(r"```python\n(.*?)```", page.read_text("utf-8"), re.DOTALL)
-        )
-        for page in PAGES
-    },
+    **{f"{page.stem.replace('-', '_')}_{number}": block for number, (page, block) in enumerate(BLOCKS)},
     **{path.stem: path.read_text("utf-8") for path in (ROOT / "examples").glob("*.py")},
 }
 
 TYPES = """
-from multidrop import Bus, InnovertIBD
+from multidrop import Bus, InnovertIBD, ModbusDevice
 
 with Bus("/dev/ttyUSB0") as bus:
     pump = bus.attach(InnovertIBD, address=1)
@@ -151,6 +152,9 @@ with Bus("/dev/ttyUSB0") as bus:
     reveal_type(pump.write(pump.acceleration_time, 20.0))
     reveal_type(pump.stop(seconds=5).ok)
     reveal_type(pump.state())
+    meter = bus.attach(ModbusDevice, address=7)
+    reveal_type(meter.read_holding(100, 2))
+    reveal_type(meter.read_input(0, format="F32"))
     pump.write(pump.acceleration_time, "fast")
     pump.red("output_current")
 """
@@ -161,6 +165,8 @@ FOUND = [
     'note: Revealed type is "float"',
     'note: Revealed type is "bool"',
     'note: Revealed type is "multidrop.drive.state.State"',
+    'note: Revealed type is "list[int]"',
+    'note: Revealed type is "list[float]"',
     'error: No overload variant of "write" of "RegisterAccess"',
     'error: "InnovertIBD" has no attribute "red"',
 ]
