@@ -178,8 +178,13 @@ class ExitHook:
 
         Raises ValueError outside the main thread, unless our handlers are already installed.
         """
-        if self._has_taken and threading.current_thread() is not threading.main_thread():
-            return
+        if threading.current_thread() is not threading.main_thread():
+            if self._has_taken:
+                return
+            raise ValueError(
+                "stop_on_exit must be set on the main thread, because Python handles signals there: create "
+                "this Bus or Poller on the main thread"
+            )
         for number in _ending():
             had = signal.getsignal(number)
             if had != self._on_signal:

@@ -25,6 +25,8 @@ from multidrop.drive.request import SERVER_ID as SERVER_ID
 from multidrop.drive.request import STATUS as STATUS
 from multidrop.drive.state import Condition, Direction, State
 from multidrop.drive.text import Text as Text
+from multidrop.drive.verbs import CommandOutcome as CommandOutcome
+from multidrop.drive.verbs import CommandResult as CommandResult
 from multidrop.drive.verbs import Read, Script, Wait, carry_out, insist, read, until, verb, wait, write
 from multidrop.drive.verbs import verb_arguments as verb_arguments
 from multidrop.errors import (
@@ -50,6 +52,8 @@ __all__ = [
     "Advice",
     "BusError",
     "Carrier",
+    "CommandOutcome",
+    "CommandResult",
     "Condition",
     "DeclarationError",
     "Direction",

@@ -188,7 +188,7 @@ class Drive(RegisterAccess):
                 raise ValueError(
                     f"{name!r} of {cls._kind()} is a text, which can be read, but not polled or written"
                 ) from None
-            hint = did_you_mean(name, cls.registers, f"see `multidrop models {cls.model}`", 3)
+            hint = did_you_mean(name, cls.registers, cls.model and f"see `multidrop models {cls.model}`", 3)
             raise ValueError(f"{cls._kind()} has no register {name!r}; {hint}") from None
 
     @classmethod

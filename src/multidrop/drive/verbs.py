@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from inspect import Signature, signature
+from inspect import Parameter, Signature, signature
 from numbers import Real
 from sys import float_info
 from typing import (
@@ -227,6 +227,15 @@ class UnattachedStop:
         return cast(CommandResult, self._drive.perform(self._make()))
 
 
+def _signature(verb: str, script: Callable[..., Any]) -> Signature:
+    """Return the signature of a verb: that of its script, and for a stop also `seconds`."""
+    whole = signature(script).replace(return_annotation=Signature.empty)
+    if verb not in STOPPING:
+        return whole
+    seconds = Parameter("seconds", Parameter.KEYWORD_ONLY, default=None, annotation="float | None")
+    return whole.replace(parameters=[*whole.parameters.values(), seconds])
+
+
 class _BoundVerb(Generic[P, R]):
     """A verb of one drive, such as `start`; calling it carries out the verb.
 
@@ -245,8 +254,8 @@ class _BoundVerb(Generic[P, R]):
 
     @property
     def __signature__(self) -> Signature:
-        whole = signature(self._script)
-        return whole.replace(parameters=[*whole.parameters.values()][1:], return_annotation=Signature.empty)
+        whole = _signature(self.name, self._script)
+        return whole.replace(parameters=[*whole.parameters.values()][1:])
 
     @overload
     def __call__(self: _BoundVerb[P, None], *args: P.args, **kwargs: P.kwargs) -> CommandResult: ...
@@ -346,7 +355,7 @@ class Verb(Generic[P, R]):
 
     @property
     def __signature__(self) -> Signature:
-        return signature(self._script).replace(return_annotation=Signature.empty)
+        return _signature(self.name, self._script)
 
     @overload
     def __call__(self: Verb[P, None], drive: Drive, *args: P.args, **kwargs: P.kwargs) -> CommandResult: ...
