@@ -79,6 +79,12 @@ def format_time(time_ns: int) -> str:
     return f"{_format_second(second)}.{rest:09d}Z"
 
 
+def iso_time(ms: int) -> str:
+    """Return a time in ms since 1970 (UTC) as text, such as 2026-11-22T09:30:00.123Z."""
+    second, rest = divmod(ms, 1000)
+    return f"{_format_second(second)}.{rest:03d}Z"
+
+
 def parse_time(text: str) -> int:
     """Return the ns since 1970 (UTC). Raises ValueError unless the text has the form of `format_time`."""
     second, dot, rest = text.partition(".")

@@ -19,7 +19,7 @@ from lines import HOST_LATE, PATIENCE, until
 
 import multidrop
 from multidrop import Batch, Bus, InvtCHE, LineError, Plant
-from multidrop.gateway.clock import boottime_ns
+from multidrop.core import boottime_ns
 from multidrop.gateway.gateway import Gateway, Notifier
 from multidrop.gateway.http.rights import Right, new_token
 from multidrop.gateway.live import drive_reads

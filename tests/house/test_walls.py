@@ -51,7 +51,6 @@ FILES_TOUCHING_THE_SYSTEM = {
     "params/apply.py",
     "polling/added_rows.py",
     "polling/row_source.py",
-    "gateway/clock.py",
     "gateway/http/connections.py",
     "gateway/gateway.py",
     "gateway/mqtt/part.py",

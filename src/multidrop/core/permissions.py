@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 from weakref import finalize
@@ -78,7 +79,7 @@ GUARD_S = 0.7
 MOST_GUARD_S = 3600.0
 MOST_NS = 1 << 62
 
-boottime_ns = lib.md_boottime_ns
+boottime_ns: Callable[[], int] = lib.md_boottime_ns
 
 
 class Mastership:

@@ -27,8 +27,8 @@ from multidrop.control.commands import (
     stop_line,
     write_register,
 )
+from multidrop.core import boottime_ns, now_ns
 from multidrop.drive import verb_arguments
-from multidrop.gateway.clock import boottime_ns, monotonic_ns
 from multidrop.gateway.http.rights import NEVER_THIS_WAY, NOT_ALLOWED, NOT_LISTED, Caller, May, Right
 from multidrop.plant import drive_meant
 from multidrop.supervisor import supervisor
@@ -147,7 +147,7 @@ class Commands:
         self._stopped_ns |= dict.fromkeys(drives, boottime_ns())
 
     def _note_end(self, drives: Iterable[str], future: object = None) -> None:
-        self._ended_ns |= dict.fromkeys(drives, monotonic_ns())
+        self._ended_ns |= dict.fromkeys(drives, now_ns())
 
     # ---- stops ----
 
@@ -310,7 +310,7 @@ class Commands:
 
             The deadline is 0, so the command is not sent, if the drive was stopped after this call.
             """
-            return until_ns - boottime_ns() + monotonic_ns() if self.stops[drive] == stops else 0
+            return until_ns - boottime_ns() + now_ns() if self.stops[drive] == stops else 0
 
         def why_not() -> CommandResult | None:
             if self.stops[drive] == stops:

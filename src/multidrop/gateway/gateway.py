@@ -20,7 +20,8 @@ import uvicorn
 import multidrop
 from multidrop import Bus, LineError, Plant, Poller
 from multidrop.control import Ledger
-from multidrop.gateway.clock import boottime_ns, monotonic_ns, now_and_slept_ns, utc_ms
+from multidrop.core import boottime_ns, now_ns
+from multidrop.gateway import utc_ms
 from multidrop.gateway.commands import Commands, FleetStops
 from multidrop.gateway.http.connections import BACKLOG, Connections, WatchedApp, WatchedProtocol, listen
 from multidrop.gateway.http.guard import MOST_HEAD
@@ -429,6 +430,13 @@ class Gateway:
         return frame | {"troubles": troubles_of(self)}
 
 
+def now_and_slept_ns() -> tuple[int, int]:
+    """Return the monotonic time, and how long the computer has slept since its boot, both in ns."""
+    booted_ns = boottime_ns()  # read first, so that a pause between the two reads never counts as sleep
+    monotonic_ns = now_ns()
+    return monotonic_ns, booted_ns - monotonic_ns
+
+
 class _Server(uvicorn.Server):
     """A web server that installs no signal handlers, because the gateway installs its own."""
 
@@ -455,7 +463,7 @@ class Notifier:
 
     def send_reloading(self) -> None:
         """Report that a reload starts, and when. A later READY=1 reports its end."""
-        self.send("RELOADING=1", f"MONOTONIC_USEC={monotonic_ns() // 1000}")
+        self.send("RELOADING=1", f"MONOTONIC_USEC={now_ns() // 1000}")
 
     def send(self, *lines: str) -> None:
         """Send lines such as READY=1, without waiting; they are lost if the manager's queue is full."""

@@ -24,12 +24,12 @@ from urllib.parse import urlsplit
 
 from multidrop import Plant
 from multidrop.exposition import MetricFamily
-from multidrop.gateway.clock import iso_time
 from multidrop.gateway.live.alarms import KINDS, Alarm, AlarmChange
 from multidrop.gateway.metrics import counter
 from multidrop.gateway.parts import PartContext, missing_library
 from multidrop.gateway.sending import Refused, RetryingSender, post
 from multidrop.gateway.settings import input_file, refuse
+from multidrop.printable import iso_time
 from multidrop.supervisor import supervisor
 
 MOST_TARGETS = 20

@@ -10,7 +10,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from multidrop import Batch, Plant, PlantError, Poller
-from multidrop.gateway.clock import utc_ms
+from multidrop.gateway import utc_ms
 from multidrop.gateway.commands import drives_of
 from multidrop.gateway.live.alarms import Limits
 from multidrop.gateway.parts import PARTS

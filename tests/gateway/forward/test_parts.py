@@ -265,7 +265,7 @@ def batch_at(time_ns: int) -> Any:
 def test_late_rows_from_before_a_reload_are_not_sent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The reload changes the unit of the register, so the unit of a late row is unknown."""
     sent: list[Any] = []
-    monkeypatch.setattr(forwarder, "monotonic_ns", lambda: 1000)
+    monkeypatch.setattr(forwarder, "now_ns", lambda: 1000)
     made: Any = Forwarding(  # type: ignore[arg-type]
         "upload",
         "it",

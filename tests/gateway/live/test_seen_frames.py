@@ -22,8 +22,8 @@ from tables import table
 
 from multidrop import Drive, WriteForbidden
 from multidrop.control import CommandResult
+from multidrop.core import boottime_ns
 from multidrop.gateway import commands as commands_module
-from multidrop.gateway.clock import boottime_ns
 from multidrop.gateway.http.rights import Right
 from multidrop.gateway.live.frames import ANOTHER_PLANT, DOUBLED, MOST_AGE_NS, TOO_LATE, SeenFrames
 

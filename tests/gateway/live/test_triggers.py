@@ -13,10 +13,10 @@ from gateways import served, written
 from lines import until
 
 from multidrop.core import Names, Status
-from multidrop.gateway.clock import iso_time
 from multidrop.gateway.live.triggers import Triggers, TriggerSettings, build
 from multidrop.polling.added_rows import AddedRow, JoinedColumns
 from multidrop.polling.batch import Batch
+from multidrop.printable import iso_time
 
 REGISTERS = ("output_current", "output_frequency", "fault", "load")
 DRIVES = Names(["pump-1", "pump-2"])

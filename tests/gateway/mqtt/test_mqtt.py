@@ -26,10 +26,10 @@ from tables import in_turn, table
 from multidrop import Drive, InvtCHE, PolledDrive
 from multidrop.channels import Channel
 from multidrop.control import CommandOutcome, CommandResult
+from multidrop.core import boottime_ns
 from multidrop.drive.number_format import NumberFormat
 from multidrop.drive.register import reading, setting
 from multidrop.families import MODELS
-from multidrop.gateway.clock import boottime_ns
 from multidrop.gateway.http.rights import COMMAND_ID
 from multidrop.gateway.mqtt.broker import MOST_UNDER_WAY
 from multidrop.gateway.mqtt.home_assistant import discovery, discovery_topic

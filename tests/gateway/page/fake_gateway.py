@@ -14,9 +14,9 @@ from urllib.parse import parse_qs, unquote, urlsplit
 
 import fake_plant
 
-from multidrop.gateway.clock import iso_time
 from multidrop.gateway.http.files import PAGE, read_files
 from multidrop.gateway.live.frames import changes
+from multidrop.printable import iso_time
 
 FILES = read_files(PAGE)
 HEADERS = {

@@ -6,7 +6,7 @@ import math
 import time
 from typing import Any
 
-from multidrop.gateway.clock import iso_time
+from multidrop.printable import iso_time
 
 # Names by line: one drive in each state. Few, because Chromium draws each drive several times a second.
 NAMES = ("pump-1 pump-2 pump-3 pump-4 conveyor-2", "filler-1 filler-2 labeller", "booster-1 tower-fan-2")

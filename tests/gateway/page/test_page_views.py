@@ -12,7 +12,7 @@ import pytest
 from fake_gateway import FakeGateway
 from watching import Opener, cell, until, until_met
 
-from multidrop.gateway.clock import iso_time
+from multidrop.printable import iso_time
 
 pytestmark = pytest.mark.long
 

@@ -21,8 +21,8 @@ from typing import Any, NamedTuple, Protocol
 import pyarrow as pa
 
 from multidrop import Batch, Plant
+from multidrop.core import now_ns
 from multidrop.exposition import MetricFamily
-from multidrop.gateway.clock import monotonic_ns
 from multidrop.gateway.metrics import counter
 from multidrop.gateway.reload import changed_drives
 from multidrop.gateway.sending import Refused, RetryingSender
@@ -329,7 +329,7 @@ class Forwarding:
 
     def adopt(self, plant: Plant) -> None:
         """Use another plant: store the measuring units of its registers with all later rows."""
-        self._adopted_ns = monotonic_ns()
+        self._adopted_ns = now_ns()
         self._changed = changed_drives(self._plant, plant)
         self._plant = plant
         self._note_units(self._adopted_ns)

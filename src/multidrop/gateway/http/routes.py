@@ -23,7 +23,7 @@ from multidrop import WriteForbidden
 from multidrop.control import CommandOutcome, CommandResult, read_audit
 from multidrop.control.commands import JoinedStops
 from multidrop.exposition import expose_metrics
-from multidrop.gateway.clock import iso_time, utc_ms
+from multidrop.gateway import utc_ms
 from multidrop.gateway.commands import STOPPING, Admit, UnknownDrive
 from multidrop.gateway.http.files import KINDS, Exports, PageFiles, attachment, parameter_file
 from multidrop.gateway.http.guard import COOKIE, HAS_WRONG_TOKEN, SHUT, WRONG, Guard
@@ -49,7 +49,7 @@ from multidrop.gateway.live.frames import WHOLE, Frames
 from multidrop.gateway.live.views import describe, drive_view, health_of, line_views
 from multidrop.gateway.metrics import families_of
 from multidrop.gateway.modbus_server.address_map import to_csv, to_json
-from multidrop.printable import is_number
+from multidrop.printable import is_number, iso_time
 from multidrop.supervisor import Hung, supervisor
 
 if TYPE_CHECKING:

@@ -9,7 +9,6 @@ from math import isfinite
 from typing import Any, NamedTuple
 
 from multidrop import Plant
-from multidrop.gateway.clock import iso_time
 from multidrop.gateway.live.hub import (
     FAULT,
     INCOMPLETE,
@@ -22,6 +21,7 @@ from multidrop.gateway.live.hub import (
     Hub,
     Shown,
 )
+from multidrop.printable import iso_time
 from multidrop.toml_check import DURATION, Key, TomlPlace, duration_of
 
 STOPPED, PORT, LIMIT = "stopped", "port", "limit"  # kinds of alarms, besides FAULT and SILENT

@@ -16,11 +16,11 @@ from math import isfinite
 from typing import Any, NamedTuple
 
 from multidrop import WriteForbidden
-from multidrop.gateway.clock import iso_time
 from multidrop.gateway.commands import MOST_AGE_S, OVERTAKEN, Commands
 from multidrop.gateway.live.alarms import LOST, Alarms
 from multidrop.gateway.live.hub import Hub, KeptRow
 from multidrop.gateway.live.recent_statistics import RecentStatistics
+from multidrop.printable import iso_time
 
 LEAST_S = 0.2  # shortest mean time, in s, between two frames
 EARLY_S = 0.02  # in s: after a late message, the next one may be early by at most this time

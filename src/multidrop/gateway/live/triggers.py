@@ -11,11 +11,12 @@ from typing import Any, NamedTuple
 
 from multidrop import Batch, Plant
 from multidrop.channels import ChannelSet, DriveSeries
-from multidrop.gateway.clock import iso_time, now_and_slept_ns
+from multidrop.core import boottime_ns, now_ns
 from multidrop.gateway.parts import PartContext
 from multidrop.gateway.settings import parsing_mistakes, refuse
 from multidrop.plant import FAULT, POST_S, PRE_S, TriggerSeries, series_of, with_triggers
 from multidrop.polling import slot_rows
+from multidrop.printable import iso_time
 from multidrop.supervisor import supervisor
 from multidrop.toml_check import DURATION, parse_duration
 
@@ -177,8 +178,7 @@ class _Conditions:
         rows = sorted(
             slot_rows(columns, self._slots), key=lambda row: (row.monotonic_ns, self._by_slot[row.slot][0])
         )
-        _, slept_ns = now_and_slept_ns()
-        for row in self._channels.compute(rows, slept_ns):
+        for row in self._channels.compute(rows, boottime_ns() - now_ns()):
             if row.status != 0:
                 continue
             was, self._was[row.slot] = self._was.get(row.slot), bool(row.value)

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any, cast
 from multidrop import Drive, PlantLine, PolledDrive, Register
 from multidrop.control import Ledger
 from multidrop.drive import verbs_of
-from multidrop.gateway.clock import iso_time
 from multidrop.gateway.commands import drives_of
 from multidrop.gateway.http.rights import Right
 from multidrop.gateway.live.frames import lost_of
 from multidrop.gateway.live.hub import FREQUENCIES, Hub, digits_of
 from multidrop.gateway.live.recent_statistics import asked_of, misses_of
 from multidrop.plant import drive_meant
+from multidrop.printable import iso_time
 from multidrop.supervisor import supervisor
 from multidrop.transport import Statistics
 

@@ -16,8 +16,8 @@ from typing import Any, Protocol
 
 from multidrop import Register, WriteForbidden
 from multidrop.control.commands import JoinedStops
+from multidrop.core import boottime_ns
 from multidrop.drive import Carrier
-from multidrop.gateway.clock import boottime_ns
 from multidrop.gateway.commands import MOST_AGE_S, STOOD_STILL, Commands
 from multidrop.gateway.http.rights import Caller, Right
 from multidrop.gateway.modbus_server.protocol import (

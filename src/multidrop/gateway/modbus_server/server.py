@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any
 
 from multidrop import BusError, Plant
-from multidrop.gateway.clock import monotonic_ns
+from multidrop.core import now_ns
 from multidrop.gateway.commands import Commands
 from multidrop.gateway.http.connections import listen
 from multidrop.gateway.http.rights import Right
@@ -143,7 +143,7 @@ class ModbusServer:
                 function,
                 addresses,
                 partial(self._hub.newest, unit.drive.name),
-                monotonic_ns(),
+                now_ns(),
                 max(self._commands.ended_ns(unit.drive.name), self._hub.woke_ns()),
             )
             if isinstance(found, Unavailable):
@@ -161,7 +161,7 @@ class ModbusServer:
             if addresses.start < reach.stop and reach.start < addresses.stop:
                 if addresses[-1] not in reach or addresses.start not in reach:
                     raise Declined(ModbusCode.ILLEGAL_ADDRESS)
-                words = block.words(self._hub, monotonic_ns())
+                words = block.words(self._hub, now_ns())
                 return words[addresses.start - start : addresses.stop - start]
         return None
 

@@ -15,7 +15,7 @@ from typing import Any
 
 from multidrop.control import CommandOutcome, CommandResult
 from multidrop.control.commands import JoinedStops
-from multidrop.gateway.clock import boottime_ns
+from multidrop.core import boottime_ns
 from multidrop.gateway.commands import MOST_AGE_S, Commands
 from multidrop.gateway.http.rights import Caller
 from multidrop.supervisor import supervisor

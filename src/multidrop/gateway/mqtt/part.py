@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from multidrop import Batch, Plant
 from multidrop.exposition import MetricFamily
-from multidrop.gateway.clock import utc_ms
+from multidrop.gateway import utc_ms
 from multidrop.gateway.live.alarms import Alarm, AlarmChange
 from multidrop.gateway.metrics import counter
 from multidrop.gateway.mqtt.broker import Broker, parse_broker
