@@ -448,7 +448,7 @@ def test_old_values_never_get_the_unit_of_measurement_of_a_new_drive(
         assert poller is not None
         path.write_text(path.read_text().replace(POLL, '["dc_bus_voltage"]'))
         assert reload(gateway)["done"]
-        until(lambda: (newest := hub.newest("fan-1", "dc_bus_voltage")) and newest.value is not None)
+        until(lambda: hub.fresh("fan-1", "dc_bus_voltage") is not None)
         opening, go_on = held_up(monkeypatch)
         # the changed key makes the reload open this line again
         text = path.read_text().replace('name = "hall"', 'name = "hall"\necho = "off"')

@@ -26,8 +26,8 @@ from multidrop.gateway.live.hub import (
     LEAST_SLEEP_NS,
     NOT_ASKED,
     Hub,
+    KeptRow,
     Known,
-    Newest,
     Shown,
     published_values,
 )
@@ -111,7 +111,10 @@ def test_a_failed_read_does_not_replace_the_last_good_value(hub: Hub) -> None:
     sent, missed = 10 * PERIOD, 11 * PERIOD
     good = next(good for one, _, good, _ in hub.known("pump-1") if one.name == "output_frequency")
     assert good == (UTC_0 + sent, sent, 25.0, 0)
-    assert hub.newest("pump-1", "output_frequency") == Newest(UTC_0 + missed, missed, None, "no reply", 10**9)
+    newest = hub.newest("pump-1", "output_frequency")
+    assert newest is not None
+    assert (*newest[:2], hub.status(newest[3])) == (UTC_0 + missed, missed, "no reply")
+    assert hub.fresh("pump-1", "output_frequency") is None
     assert is_fresh(hub)
 
 
@@ -181,6 +184,19 @@ def test_a_port_counts_as_lost_if_all_newest_rows_say_line_lost(hub: Hub, clock:
     assert hub.seen("pump-1") == Shown("silent", "port lost")
 
 
+def test_a_fresh_value_is_neither_old_nor_requested_before_a_command(hub: Hub, clock: HubClock) -> None:
+    hub.take(rows((10, FREQUENCY, 25)))
+    sent_ns = 10 * PERIOD
+    row = (UTC_0 + sent_ns, sent_ns, 25.0, 0)
+    assert hub.fresh("pump-1", "output_frequency", sent_ns) == row
+    assert hub.fresh("pump-1", "output_frequency", sent_ns + 1) is None
+    clock.now_ns = sent_ns + SECOND
+    assert hub.fresh("pump-1", "output_frequency") == row
+    clock.now_ns += 1
+    assert hub.fresh("pump-1", "output_frequency") is None
+    assert hub.fresh("pump-1", "status") is hub.fresh("pump-9", "status") is None
+
+
 def test_values_become_stale_if_no_new_rows_arrive(hub: Hub, clock: HubClock) -> None:
     """The event loop does not run, as in a suspended process."""
     hub.take(all_of(10, FORWARD, 25))
@@ -243,11 +259,10 @@ def test_values_of_an_overloaded_line_stay_fresh_for_three_cycles(tmp_path: Path
     cycle_s = hub.plant.metadata()["planned"]["hall"]["cycle_ms"] / 1000
     assert cycle_s > 1  # longer than the 0.1 s in the plant file
     hub.take(all_of(10, FORWARD, 25))
-    row = hub.newest("pump-1", "output_frequency")
-    assert row is not None
-    assert hub.holds_s("pump-1", "output_frequency") == row.holds_ns / SECOND == pytest.approx(3 * cycle_s)
+    holds_s = hub.holds_s("pump-1", "output_frequency")
+    assert holds_s == pytest.approx(3 * cycle_s)
     assert is_fresh(hub)
-    clock.now_ns += row.holds_ns + 1
+    clock.now_ns += round(holds_s * SECOND) + 1
     assert not is_fresh(hub)
 
 
@@ -409,8 +424,8 @@ COMMON = (modbus_words.FREQUENCY, modbus_words.CURRENT, modbus_words.SETPOINT)
 class FullHub(Hub):
     """A hub in which every polled register has a fresh value of 25."""
 
-    def newest(self, drive: str, register: str) -> Newest | None:
-        return Newest(1, 1, 25.0, "ok", 1)
+    def fresh(self, drive: str, register: str, since_ns: int = 0) -> KeptRow | None:
+        return 1, 1, 25.0, 0
 
     def known(self, drive: str) -> Iterator[Known]:
         for register, *_ in super().known(drive):
@@ -451,7 +466,7 @@ def test_common_modbus_registers_hide_values_of_unknown_scale() -> None:
     names = ("output_frequency", "output_current")
     drives = [polled(drive, [drive.registers[name] for name in names]) for drive in (delixi, che)]
     hub = FullHub(plant(line("/dev/null", *drives)))
-    (fan, pump) = (CommonBlock(each).words(hub, 1) for each in drives)
+    (fan, pump) = (CommonBlock(each).words(hub) for each in drives)
     assert [number(fan, at) for at in COMMON] == [2500, NO_NUMBER, NO_NUMBER]
     assert [number(pump, at) for at in COMMON] == [2500, 2500, NO_NUMBER]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import struct
 from enum import IntEnum
-from typing import Any, NamedTuple
+from typing import Any
 
 import pytest
 from batches import UTC_0, add_rows, completion
@@ -16,6 +16,7 @@ from tables import PART, table
 from multidrop.core import Columns, Names, NumberFormat, RowLayout
 from multidrop.drive import Drive
 from multidrop.drive.register import COIL, DISCRETE, HOLDING, INPUT, Register, reading, row_field
+from multidrop.gateway.live.hub import KeptRow
 from multidrop.gateway.modbus_server.protocol import InvalidHeader, MbapRequest, take_request
 from multidrop.gateway.modbus_server.words import DriveWords, Unavailable, exact_data
 from multidrop.plant.model import Polled, PolledDrive
@@ -177,39 +178,27 @@ class Meter(Drive):
     unpolled = reading(9)
 
 
-S = 1_000_000_000
+def row(value: float, at_ns: int = 1000) -> KeptRow:
+    return 0, at_ns, value, 0
 
 
-class FakeRow(NamedTuple):
-    monotonic_ns: int
-    value: float | None
-    holds_ns: int = S
-
-
-NOW = 100 * S
 ROWS = {
-    "speed": FakeRow(NOW - S // 2, 1450.0),
-    "energy": FakeRow(NOW, 0x0001_0002 / 10),
-    "status": FakeRow(NOW, 3.0),
-    "low": FakeRow(NOW, 7.0),
-    "level": FakeRow(NOW, 1.5),
-    "again": FakeRow(NOW - S, 14.5),
-    "pressure": FakeRow(NOW, 12.0),
-    "relay": FakeRow(NOW, 1.0),
-    "door": FakeRow(NOW, 0.0),
+    "speed": row(1450.0, at_ns=500),
+    "energy": row(0x0001_0002 / 10),
+    "status": row(3.0),
+    "low": row(7.0),
+    "level": row(1.5),
+    "again": row(14.5, at_ns=400),
+    "pressure": row(12.0),
+    "relay": row(1.0),
+    "door": row(0.0),
 }
 
 
-def cached() -> DriveWords:
+def read(function: int, start: int, count: int, **changed: KeptRow | None) -> list[int] | Unavailable:
     polls = tuple(Polled(Meter.registers[name], 0.1) for name in ROWS)
-    return DriveWords(PolledDrive(Meter(1), polls))
-
-
-def read(
-    function: int, start: int, count: int, *, since_ns: int = 0, **changed: FakeRow
-) -> list[int] | Unavailable:
     rows = {**ROWS, **changed}
-    return cached().read(function, range(start, start + count), rows.get, NOW, since_ns)
+    return DriveWords(PolledDrive(Meter(1), polls)).read(function, range(start, start + count), rows.get)
 
 
 def test_a_range_of_addresses_is_answered_with_the_drives_words() -> None:
@@ -227,27 +216,18 @@ def test_an_address_range_is_not_answered_if_one_word_is_unknown() -> None:
     assert read(3, 9, 1) is Unavailable.UNPOLLED
     assert read(4, 0, 2) is Unavailable.UNPOLLED
     assert read(1, 0, 1) is Unavailable.UNPOLLED
-    assert read(3, 5, 2, level=FakeRow(NOW, 0.0)) is Unavailable.UNPOLLED  # 0.0, whose sign is unknown
+    assert read(3, 5, 2, level=row(0.0)) is Unavailable.UNPOLLED  # 0.0, whose sign is unknown
 
 
-def test_an_address_range_is_not_answered_if_one_value_is_old() -> None:
-    assert read(3, 0, 4, status=FakeRow(NOW, None)) is Unavailable.STALE
-    assert read(3, 0, 4, status=FakeRow(NOW - S, 3.0)) == [1450, 2, 1, 3]
-    assert read(3, 0, 4, status=FakeRow(NOW - S - 1, 3.0)) is Unavailable.STALE
-    assert read(3, 3, 1, status=FakeRow(NOW - 6 * S, 3.0, 6 * S)) == [3]
-    assert read(3, 3, 1, status=FakeRow(NOW - 6 * S - 1, 3.0, 6 * S)) is Unavailable.STALE
-    assert cached().read(3, range(1), lambda name: None, NOW) is Unavailable.STALE
-
-
-def test_a_modbus_client_gets_no_value_polled_before_a_write() -> None:
-    assert read(3, 1, 1, since_ns=NOW) == [2]
-    assert read(3, 1, 1, since_ns=NOW + 1) is Unavailable.STALE
+def test_an_address_range_is_not_answered_if_one_value_is_not_fresh() -> None:
+    assert read(3, 0, 4, status=None) is Unavailable.STALE
+    assert read(3, 0, 1, speed=None, again=None) is Unavailable.STALE
 
 
 def test_the_newest_value_is_used_if_two_registers_have_one_address() -> None:
-    # address 0 has the registers `speed`, polled half a second ago, and `again`, polled a second ago
-    assert read(3, 0, 1, again=FakeRow(NOW, 14.49)) == [1449]
-    assert read(3, 0, 1, speed=FakeRow(NOW, None)) == [1450]
+    # address 0 has the register `speed`, and the register `again`, which was polled earlier
+    assert read(3, 0, 1, again=row(14.49)) == [1449]
+    assert read(3, 0, 1, speed=None) == [1450]
 
 
 # ---- MBAP: requests are parsed correctly however their bytes are divided ----

@@ -205,7 +205,7 @@ def test_opc_ua_values_have_the_time_of_their_request(gateway: Served, client: A
     until(lambda: read(client, "pump-1.output_frequency").SourceTimestamp > first.SourceTimestamp)
     newest = gateway.gateway.hub.newest("pump-1", "output_frequency")
     assert newest is not None
-    assert first.Value.Value == newest.value == 0.0
+    assert first.Value.Value == newest[2] == 0.0
     until(lambda: read(client, "pump-1.State").Value.Value == "stands")
 
 

@@ -17,7 +17,7 @@ from multidrop.control import CommandOutcome, CommandResult, result_of_failure
 from multidrop.drive import Drive
 from multidrop.gateway.commands import Admit
 from multidrop.gateway.http.rights import Caller
-from multidrop.gateway.live.hub import KeptRow, Newest
+from multidrop.gateway.live.hub import KeptRow
 from multidrop.gateway.modbus_server.server import ModbusServer
 from multidrop.gateway.modbus_server.settings import MAIN, ModbusSettings
 from multidrop.plant.model import Plant, PlantLine, Polled, PolledDrive
@@ -34,17 +34,20 @@ class FakeHub:
         self.states: dict[str, str] = {}
         self.woken_ns = 0
 
-    def newest(self, drive: str, register: str) -> Newest | None:
-        key = drive, register
-        if key not in self.values:
-            return None
-        age = round(self.ages.get(key, 0.0) * 1e9)
-        return Newest(0, time.monotonic_ns() - age, self.values[key], "", 1_000_000_000)
+    def _good(self, drive: str, register: str) -> KeptRow | None:
+        value = self.values.get((drive, register))
+        age_ns = round(self.ages.get((drive, register), 0.0) * 1e9)
+        return None if value is None else (0, time.monotonic_ns() - age_ns, value, 0)
+
+    def fresh(self, drive: str, register: str, since_ns: int = 0) -> KeptRow | None:
+        row, now_ns = self._good(drive, register), time.monotonic_ns()
+        return row if row and row[1] >= max(since_ns, self.woken_ns, now_ns - 1_000_000_000) else None
 
     def last_answer(self, drive: str) -> KeptRow | None:
-        rows = [self.newest(*key) for key in self.values if key[0] == drive]
-        good = [(0, row.monotonic_ns, row.value, 0) for row in rows if row and row.value is not None]
-        return max(good, default=None)
+        return max(filter(None, (self._good(*key) for key in self.values if key[0] == drive)), default=None)
+
+    def now_ns(self) -> int:
+        return time.monotonic_ns()
 
     def woke_ns(self) -> int:
         return self.woken_ns

@@ -150,9 +150,10 @@ def lost_of(hub: Hub, line: str) -> str | None:
             row = hub.newest(polled.drive.name, poll.register.name)
             if row is None:
                 continue
-            if row.status not in LOST:
+            status = hub.status(row[3])
+            if status not in LOST:
                 return None
-            statuses.add(row.status)
+            statuses.add(status)
     return hub.unopened.get(line) or max(statuses, default=None)
 
 

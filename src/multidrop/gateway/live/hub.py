@@ -66,47 +66,10 @@ class RegisterRows:
         return good is not None and good[1] >= woke_ns and now_ns - good[1] <= self.holds_ns
 
 
-class FreshValues(Mapping[str, float]):
-    """A mapping of one drive's fresh values by register; the freshness is checked at each access."""
-
-    def __init__(self, cells: Mapping[str, RegisterRows], now_ns: int, woke_ns: int) -> None:
-        self._cells = cells
-        self._now_ns = now_ns
-        self._woke_ns = woke_ns
-
-    def __getitem__(self, register: str) -> float:
-        found: float | None = self.get(register)
-        if found is None:
-            raise KeyError(register)
-        return found
-
-    def get(self, register: str, default: Any = None) -> Any:
-        cell = self._cells.get(register)
-        if cell is None or cell.good is None or not cell.is_current(self._now_ns, self._woke_ns):
-            return default
-        return cell.good[2]
-
-    def __iter__(self) -> Iterator[str]:
-        return (name for name in self._cells if name in self)
-
-    def __len__(self) -> int:
-        return sum(1 for _ in self)
-
-
 # registers that show a motor's frequency, the preferred one first
 FREQUENCIES = ("output_frequency", "motor_speed")
 MINUTE_POINTS = 60
 LEAST_POINT_MS = 900  # shortest time, in ms, between two points of the curve of the last minute
-
-
-class Newest(NamedTuple):
-    """The newest row of one register of one drive: a value, or a failed read."""
-
-    time: int  # when the request was sent, UTC in ns
-    monotonic_ns: int
-    value: float | None  # None: the read failed
-    status: str  # "ok", or the reason why the read failed
-    holds_ns: int  # how long a value of this register stays current
 
 
 class Shown(NamedTuple):
@@ -298,14 +261,20 @@ class Hub:
 
     # ---- values ----
 
-    def newest(self, drive: str, register: str) -> Newest | None:
+    def newest(self, drive: str, register: str) -> KeptRow | None:
         """Return the newest row of a register, which may be a failed read; None before the first read."""
         cell = self._cell(drive, register)
-        if cell is None or cell.newest is None:
+        return cell.newest if cell else None
+
+    def fresh(self, drive: str, register: str, since_ns: int = 0) -> KeptRow | None:
+        """Return the newest row of a register if it has a fresh value, requested at `since_ns` or later.
+
+        Return None if the newest read has failed, is too old, or is from before the computer's last sleep.
+        """
+        cell = self._cell(drive, register)
+        if cell is None or cell.newest is not cell.good or not cell.is_current(*self._times()):
             return None
-        time, monotonic_ns, value, status = cell.newest
-        good = None if status else value
-        return Newest(time, monotonic_ns, good, self._statuses[status], cell.holds_ns)
+        return cell.good if cell.good and cell.good[1] >= since_ns else None
 
     def holds_s(self, drive: str, register: str) -> float | None:
         """Return how long a value stays current, in s; None for a register that is not polled."""
@@ -351,7 +320,7 @@ class Hub:
         """
         watched = self._watched[drive]
         setpoint = watched.polled.drive.setpoint_name
-        return bool(FreshValues(watched.cells, *self._times()).get(setpoint) == 0)
+        return self._fresh_values(watched).get(setpoint) == 0
 
     def note_reset(self, drive: str) -> None:
         """Forget a fault seen in the register of past faults, because the fault was reset."""
@@ -360,8 +329,7 @@ class Hub:
             _forget_trip(watched)
 
     def _look(self, watched: _WatchedDrive) -> Shown:
-        fresh = FreshValues(watched.cells, *self._times())
-        shown = self._shown(watched, fresh)
+        shown = self._shown(watched, self._fresh_values(watched))
         if FAULT_REGISTER not in watched.cells:
             _look_for_trip(watched)
         if watched.trip is None or shown.state == SILENT:
@@ -371,13 +339,22 @@ class Hub:
             return shown
         return shown if shown.state == FAULT else Shown(FAULT, watched.trip.words, shown.note)
 
-    def _shown(self, watched: _WatchedDrive, fresh: FreshValues) -> Shown:
+    def _fresh_values(self, watched: _WatchedDrive) -> dict[str, float]:
+        """Return a drive's values by register that are not too old, even if later reads have failed."""
+        times = self._times()
+        return {
+            name: cell.good[2]
+            for name, cell in watched.cells.items()
+            if cell.good and cell.is_current(*times)
+        }
+
+    def _shown(self, watched: _WatchedDrive, fresh: Mapping[str, float]) -> Shown:
         found = watched.reader.state(fresh)
         if found is not None and found.condition is not Condition.UNKNOWN:
             fault = found.fault or UNNAMED
             words = fault if found.condition is Condition.FAULT else None
             return Shown(_STATES[found.condition], words, found.note)
-        if not any(True for _ in fresh):
+        if not fresh:
             return self._unseen(watched)
         if not watched.reader.has_state and fresh.get(FAULT_REGISTER):
             register = watched.polled.drive.registers[FAULT_REGISTER]

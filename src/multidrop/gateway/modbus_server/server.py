@@ -8,7 +8,6 @@ from functools import partial
 from typing import Any
 
 from multidrop import BusError, Plant
-from multidrop.core import now_ns
 from multidrop.gateway.commands import Commands
 from multidrop.gateway.http.connections import listen
 from multidrop.gateway.http.rights import Right
@@ -139,13 +138,8 @@ class ModbusServer:
         function = request.function
         words = self._in_blocks(unit, addresses) if function in (3, 4) else None
         if words is None:
-            found = unit.words.read(
-                function,
-                addresses,
-                partial(self._hub.newest, unit.drive.name),
-                now_ns(),
-                max(self._commands.ended_ns(unit.drive.name), self._hub.woke_ns()),
-            )
+            name, since_ns = unit.drive.name, self._commands.ended_ns(unit.drive.name)
+            found = unit.words.read(function, addresses, lambda one: self._hub.fresh(name, one, since_ns))
             if isinstance(found, Unavailable):
                 return self._pass(unit, request, addresses, found, client)
             words = found
@@ -161,7 +155,7 @@ class ModbusServer:
             if addresses.start < reach.stop and reach.start < addresses.stop:
                 if addresses[-1] not in reach or addresses.start not in reach:
                     raise Declined(ModbusCode.ILLEGAL_ADDRESS)
-                words = block.words(self._hub, now_ns())
+                words = block.words(self._hub)
                 return words[addresses.start - start : addresses.stop - start]
         return None
 

@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 from multidrop import PolledDrive, Register
 from multidrop.core import NumberFormat
 from multidrop.drive import Carrier, Table
-from multidrop.gateway.live.hub import Hub, Newest
+from multidrop.gateway.live.hub import Hub, KeptRow
 
 _FLOATS = {NumberFormat.F16: (">e", ">H"), NumberFormat.F32: (">f", ">I"), NumberFormat.F64: (">d", ">Q")}
 _OPEN = frozenset({NumberFormat.I8, NumberFormat.U32_EITHER})
@@ -54,14 +54,7 @@ class Unavailable(Enum):
     """The reason why polled values cannot answer a read."""
 
     UNPOLLED = "not polled, or the words are uncertain"
-    STALE = "polled, but the newest row is a miss or old"
-
-
-def is_fresh(row: Newest | None, now_ns: int, since_ns: int = 0) -> bool:
-    """Return True if a row has a value that is not too old and was not requested before `since_ns`."""
-    if row is None or row.value is None:
-        return False
-    return row.monotonic_ns >= since_ns and now_ns - row.monotonic_ns <= row.holds_ns
+    STALE = "polled, but the newest read has failed or is old"
 
 
 def is_certain(register: Register[Any]) -> bool:
@@ -135,15 +128,12 @@ class _PolledRegister:
         self._value: float | None = None
         self._data: bytes | None = None
 
-    def word(self, row: Newest | None, at: int, now_ns: int, since_ns: int) -> int | Unavailable:
-        """Return the word at the offset `at` in the register's newest value, or why it is unknown.
-
-        Failed reads, stale values and values requested before `since_ns` are not used.
-        """
-        if row is None or not is_fresh(row, now_ns, since_ns):
+    def word(self, row: KeptRow | None, at: int) -> int | Unavailable:
+        """Return the word at the offset `at` in the value of a fresh row, or why it is unknown."""
+        if row is None:
             return Unavailable.STALE
-        value = row.value
-        if value is not None and value != self._value:
+        value = row[2]
+        if value != self._value:
             self._value, self._data = value, exact_data(self._register, value)
         data = self._data
         if data is None:
@@ -170,17 +160,11 @@ class DriveWords:
                 self._at.setdefault(key, []).append((found, at))
 
     def read(
-        self,
-        function: int,
-        addresses: range,
-        newest: Callable[[str], Newest | None],
-        now_ns: int,
-        since_ns: int = 0,
+        self, function: int, addresses: range, fresh: Callable[[str], KeptRow | None]
     ) -> list[int] | Unavailable:
         """Return the words or bits at these addresses from fresh polled values, or why that is impossible.
 
-        `newest` returns the newest read of a register by name. Values requested before `since_ns` are not
-        used.
+        `fresh` returns the newest row of a register by name, if it has a fresh value.
         """
         words: list[int] = []
         reasons: list[Unavailable] = []
@@ -190,10 +174,9 @@ class DriveWords:
                 return Unavailable.UNPOLLED
             if len(found) == 1:
                 polled, at = found[0]
-                word = polled.word(newest(polled.name), at, now_ns, since_ns)
+                word = polled.word(fresh(polled.name), at)
             else:
-                rows = [(newest(polled.name), polled, at) for polled, at in found]
-                word = _newest_word(rows, now_ns, since_ns)
+                word = _newest_word([(fresh(polled.name), polled, at) for polled, at in found])
             if isinstance(word, Unavailable):
                 reasons.append(word)
             else:
@@ -203,13 +186,11 @@ class DriveWords:
         return words
 
 
-def _newest_word(
-    found: list[tuple[Newest | None, _PolledRegister, int]], now_ns: int, since_ns: int
-) -> int | Unavailable:
+def _newest_word(found: list[tuple[KeptRow | None, _PolledRegister, int]]) -> int | Unavailable:
     """Return the word at an address that belongs to several registers. The newest read decides."""
     reason = Unavailable.STALE
-    for row, polled, at in sorted(found, key=lambda one: -one[0].monotonic_ns if one[0] else 0):
-        word = polled.word(row, at, now_ns, since_ns)
+    for row, polled, at in sorted(found, key=lambda one: -one[0][1] if one[0] else 0):
+        word = polled.word(row, at)
         if not isinstance(word, Unavailable):
             return word
         if word is Unavailable.UNPOLLED:
@@ -266,43 +247,43 @@ class CommonBlock:
             (SETPOINT, polled.drive.setpoint_name, None),
         )
 
-    def words(self, hub: Hub, now_ns: int) -> list[int]:
-        """Return all words of the drive's common block at the monotonic time `now_ns`."""
-        state, woke_ns = hub.state(self._name), hub.woke_ns()
+    def words(self, hub: Hub) -> list[int]:
+        """Return all words of the drive's common block."""
+        state = hub.state(self._name)
         words = [0] * COMMON_LENGTH
         words[STATE] = STATES.get(state, 0)
-        words[FAULT] = self._fault(hub, now_ns, woke_ns, state)
+        words[FAULT] = self._fault(hub, state)
         for at, name, unit in self._numbers:
-            value = self._fresh_value(hub, now_ns, woke_ns, name, unit)
+            value = self._fresh_value(hub, name, unit)
             words[at : at + 2] = _two_words(NO_NUMBER if value is None else _hundredths(value))
-        words[AGE : AGE + 2] = _two_words(self._age(hub, now_ns, woke_ns))
+        words[AGE : AGE + 2] = _two_words(self._age(hub))
         return words
 
-    def _fresh_value(self, hub: Hub, now_ns: int, woke_ns: int, name: str, unit: str | None) -> float | None:
+    def _fresh_value(self, hub: Hub, name: str, unit: str | None) -> float | None:
         """Return a polled register's fresh value; None if there is none, or if its unit is not `unit`.
 
         With `unit` None, any unit fits.
         """
-        row = hub.newest(self._name, name) if (name, unit) in self._polled else None
-        return row.value if row and is_fresh(row, now_ns, woke_ns) else None
+        row = hub.fresh(self._name, name) if (name, unit) in self._polled else None
+        return row[2] if row else None
 
-    def _fault(self, hub: Hub, now_ns: int, woke_ns: int, state: str) -> int:
+    def _fault(self, hub: Hub, state: str) -> int:
         """Return the drive's own number of the present fault, or one of the reserved fault numbers."""
         if state != "fault":
             return NO_FAULT if state in ("stands", "runs") else FAULT_UNKNOWN
-        value = self._fresh_value(hub, now_ns, woke_ns, "fault", "")
+        value = self._fresh_value(hub, "fault", "")
         if value is None or not value.is_integer() or not 0 < value < FAULT_WITHOUT_NUMBER:
             return FAULT_WITHOUT_NUMBER
         return int(value)
 
-    def _age(self, hub: Hub, now_ns: int, woke_ns: int) -> int:
+    def _age(self, hub: Hub) -> int:
         """Return the time since the drive's newest value was requested, in ms."""
         answer = hub.last_answer(self._name)
         if answer is None:
             return NEVER
-        if answer[1] < woke_ns:  # the computer slept after the request, for an unknown time
+        if answer[1] < hub.woke_ns():  # the computer slept after the request, for an unknown time
             return LONGEST_AGE
-        return min(max(now_ns - answer[1], 0) // 1_000_000, LONGEST_AGE)
+        return min(max(hub.now_ns() - answer[1], 0) // 1_000_000, LONGEST_AGE)
 
 
 class ChannelBlock:
@@ -313,15 +294,10 @@ class ChannelBlock:
         self.channels = polled.channels
         self.length = 2 * len(self.channels)
 
-    def words(self, hub: Hub, now_ns: int) -> list[int]:
-        """Return the block's words at the monotonic time `now_ns`. A value that is not fresh is NaN."""
-        since_ns = hub.woke_ns()
-        words: list[int] = []
-        for channel in self.channels:
-            row = hub.newest(self._drive, channel.name)
-            value = row.value if row and is_fresh(row, now_ns, since_ns) else None
-            words += struct.unpack(">2H", _float(math.nan if value is None else value))
-        return words
+    def words(self, hub: Hub) -> list[int]:
+        """Return the block's words. A value that is not fresh is NaN."""
+        rows = [hub.fresh(self._drive, channel.name) for channel in self.channels]
+        return [word for row in rows for word in struct.unpack(">2H", _float(row[2] if row else math.nan))]
 
 
 def _float(value: float) -> bytes:
