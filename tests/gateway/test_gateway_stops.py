@@ -45,7 +45,7 @@ BROKEN = f"{MAY}[serve.history]\n[serve.mqtt]\n"
 @pytest.fixture
 def _broken_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("history", "mqtt"):
-        monkeypatch.setitem(parts.PARTS, name, "broken_part")  # type: ignore[arg-type]
+        monkeypatch.setitem(parts.PARTS, name, "broken_part:Settings")  # type: ignore[arg-type]
 
 
 def calling(gateway: Served) -> socket.socket:

@@ -60,9 +60,6 @@ class FleetSettings:
             raise ValueError("\n".join(wrong))
 
 
-Settings = FleetSettings
-
-
 class FleetPart:
     """The part `fleet`, which reads a fleet's state once a second.
 

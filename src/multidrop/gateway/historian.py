@@ -51,9 +51,6 @@ class HistorySettings:
         refuse(parsing_mistakes(self, keep=parse_age, most=parse_size, rotate=parse_age))
 
 
-Settings = HistorySettings
-
-
 def build(settings: HistorySettings, context: PartContext) -> Historian:
     """Return the historian of a gateway. Imports DuckDB now, so that the first query is not delayed."""
     with suppress(ImportError):

@@ -85,9 +85,6 @@ class NotifySettings:
         return wrong
 
 
-Settings = NotifySettings
-
-
 def read_targets(path: Path) -> tuple[list[AlarmTarget], list[str]]:
     """Return the targets in a file, and an error sentence for each mistake. Raises OSError."""
     with path.open("rb") as file:

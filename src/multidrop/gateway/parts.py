@@ -25,21 +25,21 @@ from multidrop.supervisor import supervisor
 BUILD_S = 3.0  # in s: how long a start or a reload waits for parts that are being built
 END_S = 3.0  # time limit, in s, for closing one part, such as MQTT
 
-# Python modules of the parts, by the name of the part's table. A module is imported if the plant file has the
-# table. It has `Settings`, a frozen dataclass of the table's keys and their defaults, and
-# `build(settings, context)`, which returns a Part.
+# The Python module of each part, and the class of its settings, by the name of the part's table. A module is
+# imported if the plant file has the table. The class is a frozen dataclass of the table's keys and their
+# defaults. The module's function `build(settings, context)` returns a Part.
 PARTS: Mapping[str, str] = {
-    "fleet": "multidrop.fleet.page_part",
-    "history": "multidrop.gateway.historian",
-    "influx": "multidrop.gateway.forward.influx",
-    "modbus": "multidrop.gateway.modbus_server.server",
-    "mqtt": "multidrop.gateway.mqtt.part",
-    "notify": "multidrop.gateway.notifications",
-    "opcua": "multidrop.gateway.opcua.part",
-    "postgres": "multidrop.gateway.forward.postgres",
-    "tool": "multidrop.gateway.modbus_server.tool_ports",
-    "trigger": "multidrop.gateway.live.triggers",
-    "upload": "multidrop.gateway.forward.upload",
+    "fleet": "multidrop.fleet.page_part:FleetSettings",
+    "history": "multidrop.gateway.historian:HistorySettings",
+    "influx": "multidrop.gateway.forward.http:InfluxSettings",
+    "modbus": "multidrop.gateway.modbus_server.server:ModbusSettings",
+    "mqtt": "multidrop.gateway.mqtt.part:MqttSettings",
+    "notify": "multidrop.gateway.notifications:NotifySettings",
+    "opcua": "multidrop.gateway.opcua.part:OpcUaSettings",
+    "postgres": "multidrop.gateway.forward.postgres:PostgresSettings",
+    "tool": "multidrop.gateway.modbus_server.tool_ports:ToolSettings",
+    "trigger": "multidrop.gateway.live.triggers:TriggerSettings",
+    "upload": "multidrop.gateway.forward.http:UploadSettings",
 }
 # extras of multidrop, by the library that they install
 EXTRAS = {"pyarrow": "parquet", "psycopg": "postgres"}
@@ -98,7 +98,8 @@ def build(name: str, settings: object, context: PartContext) -> Part:
     If a library is missing, raises ValueError with the name of the extra that installs it.
     """
     try:
-        part: Part = import_module(PARTS[name]).build(settings, context)
+        module, _, _ = PARTS[name].partition(":")
+        part: Part = import_module(module).build(settings, context)
     except ImportError as missing:
         raise ValueError(missing_library(name, missing)) from missing
     return part

@@ -14,9 +14,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import MISSING, Field, dataclass, field, fields, replace
 from functools import partial
-from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any
 
 from multidrop import Plant, PlantError
@@ -392,7 +392,7 @@ def _settings_of(part: str) -> tuple[Any, dict[str, Key]]:
 
     The class has a field for each key. A field's metadata are the JSON Schema keywords of its key.
     """
-    made = import_module(PARTS[part]).Settings
+    made = resolve_name(PARTS[part])
     return made, {one.name: _key_of(one) for one in fields(made) if one.init}
 
 

@@ -28,7 +28,7 @@ from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout
 from multidrop.drive.register import reading
 from multidrop.gateway.forward import forwarder
 from multidrop.gateway.forward.forwarder import MOST_ROWS, Forwarding, pieces, row_objects
-from multidrop.gateway.forward.influx import line_protocol
+from multidrop.gateway.forward.http import line_protocol
 from multidrop.gateway.http.rights import Right
 from multidrop.gateway.parts import missing_library
 from multidrop.gateway.settings import read_settings

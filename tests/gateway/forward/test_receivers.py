@@ -32,7 +32,7 @@ from postgres_clusters import postgres
 from spooled import NOON, STEP, rows_of
 from tables import first_in_ci
 
-from multidrop.gateway.forward.influx import line_protocol
+from multidrop.gateway.forward.http import line_protocol
 from multidrop.gateway.sending import post
 from multidrop.printable import parse_time
 from multidrop.samples import unpack

@@ -12,9 +12,9 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from importlib import import_module
 from itertools import count
 from pathlib import Path
+from pkgutil import resolve_name
 from types import SimpleNamespace
 from typing import Any
 
@@ -27,7 +27,7 @@ from multidrop.gateway.forward.forwarder import Forwarding, Outgoing, RepeatingR
 from multidrop.gateway.mqtt.broker import Login, parse_broker
 from multidrop.gateway.mqtt.rows import json_rows
 from multidrop.gateway.mqtt.settings import MqttSettings
-from multidrop.gateway.parts import PARTS
+from multidrop.gateway.parts import PARTS, build
 from multidrop.printable import parse_time
 from multidrop.samples import ROWS, Spool
 
@@ -40,9 +40,9 @@ def forwarding(kind: str, where: str, folder: Path) -> Forwarding:
     context: Any = SimpleNamespace(plant=Plant((), folder / "plant.toml"), folder=folder)
     if kind == "mqtt":
         return json_rows(MqttSettings(where, rows=True), context, parse_broker(where), Login())
-    part = import_module(PARTS[kind])
     key = "database" if kind == "postgres" else "url"
-    made: Forwarding = part.build(part.Settings(**{key: where}), context)
+    made: Any = build(kind, resolve_name(PARTS[kind])(**{key: where}), context)
+    assert isinstance(made, Forwarding)
     return made
 
 

@@ -7,6 +7,7 @@ A message's rows and the new position are stored in one transaction.
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import psycopg
@@ -47,11 +48,8 @@ class PostgresSettings:
             wrong.append('database is not a connection string; write database = "host=db dbname=plant"')
         refuse(wrong)
 
-    def check(self, plant: Plant) -> list[str]:
-        return [*secret_mistakes("password", self.password, plant)]
-
-
-Settings = PostgresSettings
+    def check(self, plant: Plant) -> Iterator[str]:
+        return secret_mistakes("password", self.password, plant)
 
 
 def build(settings: PostgresSettings, context: PartContext) -> Forwarding:

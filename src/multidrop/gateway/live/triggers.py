@@ -58,9 +58,6 @@ class TriggerSettings:
         return []
 
 
-Settings = TriggerSettings
-
-
 def build(settings: TriggerSettings, context: PartContext) -> Triggers:
     """Return the triggers of a gateway. Call it in a thread: a large plant takes seconds."""
     return Triggers(settings, context.plant)

@@ -29,8 +29,6 @@ from multidrop.gateway.modbus_server.settings import MAIN, ModbusSettings, Unit,
 from multidrop.gateway.modbus_server.words import Unavailable
 from multidrop.gateway.parts import Ask, PartContext
 
-Settings = ModbusSettings
-
 
 def build(settings: ModbusSettings, context: PartContext) -> ModbusServer:
     """Return the listening server. Raises OSError if a port cannot be opened."""

@@ -100,10 +100,16 @@ class ToolSettings:
     def __post_init__(self) -> None:
         refuse(self._mistakes())
 
-    def check(self, plant: Plant) -> list[str]:
-        """Return an error for each line in `pty` or `rtu` that is unknown or has no Modbus drives."""
+    def check(self, plant: Plant) -> Iterator[str]:
+        """Yield an error for each line in `pty` or `rtu` that is unknown or has no Modbus drives."""
         lines = {line.name: line for line in plant.lines}
-        return [*self._line_mistakes(lines)] if lines else []
+        for key, given in (("pty", self.pty), ("rtu", self.rtu)):
+            for name in given if lines else ():
+                line = lines.get(name)
+                if line is None:
+                    yield f"{key}: there is no line {name!r}; {did_you_mean(name, lines)}"
+                elif all(polled.drive.framing is Framing.DELIXI for polled in line.drives):
+                    yield f"{key}: all drives of line {name} speak Delixi's own protocol; tools need Modbus"
 
     def may_connect(self, address: str) -> bool:
         return is_allowed(address, self.clients)
@@ -116,15 +122,6 @@ class ToolSettings:
     @property
     def lines(self) -> list[str]:
         return [*dict.fromkeys((*self.pty, *self.rtu))]
-
-    def _line_mistakes(self, lines: Mapping[str, PlantLine]) -> Iterator[str]:
-        for key, given in (("pty", self.pty), ("rtu", self.rtu)):
-            for name in given:
-                line = lines.get(name)
-                if line is None:
-                    yield f"{key}: there is no line {name!r}; {did_you_mean(name, lines)}"
-                elif all(polled.drive.framing is Framing.DELIXI for polled in line.drives):
-                    yield f"{key}: all drives of line {name} speak Delixi's own protocol; tools need Modbus"
 
     def _mistakes(self) -> Iterator[str]:
         if sys.platform == "win32":
@@ -147,9 +144,6 @@ class ToolSettings:
                 if where in owners and not where.endswith(":0"):
                     yield f"{key}: {line} = {where!r} is in use by {owners[where]}"
                 owners[where] = line
-
-
-Settings = ToolSettings
 
 
 def build(settings: ToolSettings, context: PartContext) -> ToolPorts:

@@ -21,8 +21,6 @@ from multidrop.supervisor import supervisor
 if TYPE_CHECKING:
     from multidrop.gateway.forward.forwarder import Forwarding
 
-Settings = MqttSettings
-
 
 def build(settings: MqttSettings, context: PartContext) -> Mqtt:
     """Return the MQTT interface. Raises ImportError without the library paho."""

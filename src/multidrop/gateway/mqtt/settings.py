@@ -87,11 +87,8 @@ class MqttSettings:
         """The names of the Python libraries that these settings need."""
         return ("paho", "pyarrow") if self.rows else ("paho",)
 
-    def check(self, plant: Plant) -> list[str]:
-        """Return a sentence for each missing file, and each drive name that cannot be a topic."""
-        return [*self._mistakes_in(plant)]
-
-    def _mistakes_in(self, plant: Plant) -> Iterator[str]:
+    def check(self, plant: Plant) -> Iterator[str]:
+        """Yield a sentence for each missing file, and each drive name that cannot be a topic."""
         for key, name in (("password", self.password), ("authorities", self.authorities)):
             path = _beside(plant, name)
             if name and not path.is_file():

@@ -75,15 +75,12 @@ class OpcUaSettings:
         """The host and port of the listening socket, by its setting's key."""
         return {"listen": self.address}
 
-    def check(self, plant: Plant) -> list[str]:
-        """Return an error sentence for each mistake.
+    def check(self, plant: Plant) -> Iterator[str]:
+        """Yield an error sentence for each mistake.
 
         These are a missing certificate or key file, an address that other machines reach without a
         certificate and tokens, and a name of a drive or channel that gives two nodes the same id.
         """
-        return [*self._mistakes_in(plant)]
-
-    def _mistakes_in(self, plant: Plant) -> Iterator[str]:
         if not is_loopback(self.address[0]) and not (self.certificate and "tokens" in plant.serve):
             yield (
                 f'listen = "{self.listen}" is open to other machines: that needs certificate and key here '
@@ -104,9 +101,6 @@ class OpcUaSettings:
                     yield f'drive "{name}" has the node id of a value of "{owner}": choose another name'
             for channel in channels[name] & {*MEMBERS}:
                 yield f'channel "{channel}" of "{name}" has the node id of another value: choose another name'
-
-
-Settings = OpcUaSettings
 
 
 def build(settings: OpcUaSettings, context: PartContext) -> OpcUa:
