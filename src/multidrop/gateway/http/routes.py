@@ -43,7 +43,7 @@ from multidrop.gateway.http.messages import (
     takes_gzip,
     text_in,
 )
-from multidrop.gateway.http.operations import FRAME, NEEDED, OPERATIONS, Operation, openapi
+from multidrop.gateway.http.operations import FRAME_PATH, NEEDED, OPERATIONS, Operation, openapi
 from multidrop.gateway.http.rights import NEVER_THIS_WAY, NOT_ALLOWED, NOT_LISTED, Caller
 from multidrop.gateway.live.frames import WHOLE, Frames
 from multidrop.gateway.live.views import describe, drive_view, health_of, line_views
@@ -92,8 +92,8 @@ def make_app(gateway: Gateway) -> ASGIApp:
     others = Starlette(routes=routes, exception_handlers=handlers)
 
     async def app(scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer without the router if the path is FRAME, because most requests have this path."""
-        await (pages.frame if scope["path"] == FRAME else others)(scope, receive, send)
+        """Answer without the router if the path is FRAME_PATH, because most requests have this path."""
+        await (pages.frame if scope["path"] == FRAME_PATH else others)(scope, receive, send)
 
     return Guard(
         app,
@@ -109,7 +109,7 @@ def make_app(gateway: Gateway) -> ASGIApp:
 def _endpoint(pages: Pages, operation: Operation) -> Any:
     """Return the function that answers a route. It compresses answers to GET that are not compressed yet."""
     handler = getattr(pages, operation.handler)
-    if operation.method == "POST" or operation.path == FRAME:
+    if operation.method == "POST" or operation.path == FRAME_PATH:
         return handler
 
     async def answer(request: Request) -> Response:
