@@ -128,6 +128,8 @@ def test_the_repr_of_a_recording_shows_its_rows_drives_and_time_span(tmp_path: P
     about = r"^<recording .*run\.csv: 4 rows of 2 drives, 3\.000 s from .*>$"
     path = record(tmp_path / "run.csv", [row(at, f"pump-{at % 2}", "speed", 1.0) for at in range(4)])
     assert re.match(about, repr(multidrop.open_recording(path)))
+    with open_writer(tmp_path / "new.csv", METADATA) as writer:
+        assert repr(writer) == f"<CsvWriter {tmp_path}/new.csv: 0 rows>"
 
 
 WITHOUT = "import sys; sys.modules['nanoarrow'] = None; from multidrop.cli import main; sys.exit(main())"

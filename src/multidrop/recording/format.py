@@ -51,6 +51,9 @@ class RecordingWriter(ABC):
         self.path = path
         self.rows = 0
 
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.path}: {self.rows} rows>"
+
     @abstractmethod
     def write(self, batch: Rows) -> None:
         """Append the batch's rows. Raises RecordingError."""
