@@ -17,9 +17,10 @@ from pathlib import Path
 from queue import SimpleQueue
 
 from edits import Mutant, Name, mutants
-from trials import ROOT, TRIALS, attempt, scratch
+from trials import OUTPUT, ROOT, TRIALS, attempt, scratch
 
 EXPLAINED = Path(__file__).with_name("explained.toml")
+MOST_SHOWN = 3000  # limit of shown characters, from the end of a failed command's output
 
 
 def explained() -> dict[Name, str]:
@@ -48,8 +49,11 @@ def ends(path: str) -> Iterator[tuple[Mutant, str | None]]:
         jobs = len(os.sched_getaffinity(0))
         for _ in range(jobs):
             trees.put(stack.enter_context(scratch()))
-        if end(source) not in {None, "same code"}:
-            sys.exit(f"the tests of {path} fail without a mistake, too")
+        tree = trees.get()
+        if attempt(tree, path, source) not in {None, "same code"}:
+            output = (tree / OUTPUT).read_text("utf-8", "replace")
+            sys.exit(f"{output[-MOST_SHOWN:]}\nthe tests of {path} fail without a mistake, too")
+        trees.put(tree)
         tried = stack.enter_context(ThreadPoolExecutor(jobs)).map(end, (each.text for each in found))
         yield from zip(found, tried, strict=True)
 
