@@ -27,10 +27,10 @@ from multidrop.core import (
     TransactionMode,
 )
 from multidrop.core.process import register_at_fork, undisturbed
-from multidrop.drive.family import Drive, check_drive
+from multidrop.drive.family import Drive
+from multidrop.drive.link import check_drive
 from multidrop.drive.register import Register
-from multidrop.drive.state import State
-from multidrop.drive.verbs import TRIES
+from multidrop.drive.verbs import TRIES, State
 from multidrop.errors import BusError, LineError
 from multidrop.transport.aside_log import log_aside
 from multidrop.transport.exchange import Exchanges

@@ -23,7 +23,6 @@ from multidrop.control.records import read_audit, written_by
 from multidrop.core import Message
 from multidrop.drive import Direction, Drive, Script, State, read, write
 from multidrop.drive.register import Kept, reading, setting
-from multidrop.drive.state import KnownSetpoint
 from multidrop.drive.verbs import verb
 from multidrop.errors import (
     BusError,
@@ -429,21 +428,21 @@ def test_a_write_of_the_setpoint_register_sets_the_known_setpoint() -> None:
 
 @pytest.mark.parametrize("later", [30.0, None])
 def test_an_unsent_write_does_not_change_a_later_setpoint(later: float | None) -> None:
-    setpoint = KnownSetpoint()
-    setpoint.value = 20.0
-    take_back = setpoint.begin_write()
-    setpoint.begin_write()  # if `later` is None, this write is still pending
+    drive = YD1000(1)
+    drive.commanded = 20.0
+    take_back = drive.begin_setpoint()
+    drive.begin_setpoint()  # if `later` is None, this write is still pending
     if later:
-        setpoint.value = later
+        drive.commanded = later
     take_back()
-    assert setpoint.value == later
+    assert drive.commanded == later
 
 
 def test_two_unsent_writes_leave_the_known_setpoint_unchanged() -> None:
-    setpoint = KnownSetpoint()
-    setpoint.value = 20.0
-    first, second = setpoint.begin_write(), setpoint.begin_write()
+    drive = YD1000(1)
+    drive.commanded = 20.0
+    first, second = drive.begin_setpoint(), drive.begin_setpoint()
     second()
-    assert setpoint.value is None
+    assert drive.commanded is None
     first()
-    assert setpoint.value == 20.0
+    assert drive.commanded == 20.0

@@ -14,8 +14,7 @@ from tables import table
 from multidrop.core import Framing, NumberFormat
 from multidrop.drive import Drive, Script, insist
 from multidrop.drive.declaration_check import DeclarationError
-from multidrop.drive.options import Option
-from multidrop.drive.register import COIL, HOLDING, INPUT, Register, Table, command, reading, setting
+from multidrop.drive.register import COIL, HOLDING, INPUT, Option, Register, Table, command, reading, setting
 from multidrop.drive.verbs import VERBS, verb
 from multidrop.families import DelixiNative, InnovertIBD
 

@@ -32,9 +32,8 @@ from multidrop.drive.register import (
     reading,
     setting,
 )
-from multidrop.drive.state import State
 from multidrop.drive.text import Text, text
-from multidrop.drive.verbs import Script, read, verb
+from multidrop.drive.verbs import Script, State, read, verb
 from multidrop.families import MODELS
 from multidrop.families.registry import SHIPPED, shipped_family
 from multidrop.scan.scanner import _read

@@ -164,7 +164,7 @@ FOUND = [
     'note: Revealed type is "dict[str, Any]"',
     'note: Revealed type is "float"',
     'note: Revealed type is "bool"',
-    'note: Revealed type is "multidrop.drive.state.State"',
+    'note: Revealed type is "multidrop.drive.verbs.State"',
     'note: Revealed type is "list[int]"',
     'note: Revealed type is "list[float]"',
     'error: No overload variant of "write" of "RegisterAccess"',

@@ -24,7 +24,7 @@ from multidrop.toml_check import parse_duration
 
 FAMILY = """\
 from multidrop.drive.family import Drive, Framing
-from multidrop.drive.options import Option
+from multidrop.drive.register import Option
 from multidrop.drive.register import command, reading, setting
 
 class Toy(Drive):

@@ -16,8 +16,7 @@ from multidrop.cli.support.output import print_text, warn
 from multidrop.cli.support.values import LONGEST_NAME, aligned, user_title, wrapped
 from multidrop.core import Framing, NumberFormat
 from multidrop.drive.family import Drive
-from multidrop.drive.options import Option
-from multidrop.drive.register import Access, Carrier, Kept, Register, Table
+from multidrop.drive.register import Access, Carrier, Kept, Option, Register, Table
 from multidrop.drive.request import read_limit, stated_limit
 from multidrop.drive.text import Text
 from multidrop.drive.verbs import VERBS

@@ -42,8 +42,7 @@ from multidrop.control.outcome import Seen, Stopped
 from multidrop.control.records import AuditLog
 from multidrop.control.stops import LEAST_S
 from multidrop.drive.family import Drive
-from multidrop.drive.state import Direction, State
-from multidrop.drive.verbs import Script, Write
+from multidrop.drive.verbs import Direction, Script, State, Write
 from multidrop.errors import LineError, Unsupported
 from multidrop.plant.model import Plant, PlantLine
 from multidrop.transport import clock

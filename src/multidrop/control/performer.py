@@ -15,12 +15,12 @@ from multidrop.control.rules import check_broadcast, check_plain, is_harmless, i
 from multidrop.control.stops import Stopper
 from multidrop.control.writer import Writer
 from multidrop.core import Framing, Message
-from multidrop.drive.family import Drive, check_own, check_own_text
+from multidrop.drive.family import Drive
+from multidrop.drive.link import check_own, check_own_text
 from multidrop.drive.register import Register
 from multidrop.drive.request import check_no_read
-from multidrop.drive.state import State
 from multidrop.drive.text import Text
-from multidrop.drive.verbs import CalledStop, Insist, Read, Script, Step, Wait, Write, carry_out
+from multidrop.drive.verbs import CalledStop, Insist, Read, Script, State, Step, Wait, Write, carry_out
 from multidrop.errors import BusError, CancelledByStop, DriveException, Unconfirmed, WriteForbidden
 from multidrop.transport import clock
 from multidrop.transport.exchange import READ_FAILURES, Exchanges

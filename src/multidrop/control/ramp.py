@@ -11,10 +11,10 @@ from math import inf
 from multidrop.control.call import Call
 from multidrop.control.rules import conditions, raw_count, wears
 from multidrop.core import PAUSE_NS
-from multidrop.drive.family import Drive, check_drive
+from multidrop.drive.family import Drive
+from multidrop.drive.link import check_drive
 from multidrop.drive.register import Kept, Register
-from multidrop.drive.state import Direction
-from multidrop.drive.verbs import Script, Write, read, wait
+from multidrop.drive.verbs import Direction, Script, Write, read, wait
 from multidrop.errors import NotAttached, WriteForbidden
 from multidrop.printable import is_number
 from multidrop.transport import clock

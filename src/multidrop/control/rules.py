@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from typing import Any, TypeVar
 
-from multidrop.drive.family import Drive, check_own
+from multidrop.drive.family import Drive
+from multidrop.drive.link import check_own
 from multidrop.drive.register import Access, Carrier, Kept, Register
-from multidrop.drive.state import Condition
-from multidrop.drive.verbs import VERBS, Script, read
+from multidrop.drive.verbs import VERBS, Condition, Script, read
 from multidrop.errors import Advice, Unsupported, WriteForbidden
 
 T = TypeVar("T", bound=float)

@@ -12,8 +12,7 @@ from typing import Any
 from multidrop.core import MOST_INVALID, Framing, NumberFormat
 from multidrop.drive.line_settings import LONGEST_SILENCE, Settings
 from multidrop.drive.number_format import FLOATS, ORDERS, WORDS, width
-from multidrop.drive.options import Option
-from multidrop.drive.register import LANGUAGES, Access, Carrier, Kept, Register, Table
+from multidrop.drive.register import LANGUAGES, Access, Carrier, Kept, Option, Register, Table
 from multidrop.drive.request import LONGEST_INTERVAL, STANDARD_LIMITS, may_be_crossed, read_limit
 from multidrop.drive.text import Text
 from multidrop.printable import is_whole

@@ -7,7 +7,7 @@ a script, whose steps are carried out by the bus that the drive is attached to.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 from multidrop.core import MODBUS, Framing
 from multidrop.drive.declaration_check import (
@@ -19,16 +19,17 @@ from multidrop.drive.declaration_check import (
 )
 from multidrop.drive.line_settings import Settings, check_agreed_silence, first_given, framing_on, supported
 from multidrop.drive.link import NO_LINK, Link, RegisterAccess
-from multidrop.drive.options import Option, checked_options, confirmation, doubt
-from multidrop.drive.parameters import Parameter, ParameterSpace
-from multidrop.drive.register import Access, Kept, Register, Table
-from multidrop.drive.state import Condition, Direction, KnownSetpoint, State
+from multidrop.drive.parameters import ParameterSpace
+from multidrop.drive.register import Access, Kept, Option, Register, Table
 from multidrop.drive.text import Text
 from multidrop.drive.verbs import (
     MOVING,
     VERB_OPTIONS,
     CalledStop,
+    Condition,
+    Direction,
     Script,
+    State,
     read,
     until,
     verb,
@@ -36,14 +37,22 @@ from multidrop.drive.verbs import (
     write,
 )
 from multidrop.errors import Advice, NotVerified, Unconfirmed, Unsupported, WriteForbidden
-from multidrop.printable import did_you_mean
+from multidrop.printable import did_you_mean, is_number
 
 START_TIME = 5.0  # seconds within which a started motor must be seen to turn
 REVERSAL_TIME = 60.0  # seconds allowed for a reversal without the option `stop_time`
 _SETPOINT_FIRST = Advice("call set_frequency before start", "add --frequency HZ")
 _TURNING = (Condition.RUNNING, Condition.ACCELERATING, Condition.DECELERATING)
+_CONFIRMED = Option("", (0, 1), "1: its name plate says what it is; the class has no `identify`")
+_CHECKED = Option("", (0, 1), "1: its name plate says what it is, and `multidrop check` of its file was read")
 
 A = TypeVar("A")
+
+
+class _PendingWrite(NamedTuple):
+    """A write of the setpoint that has not ended yet."""
+
+    before: float | _PendingWrite | None
 
 
 class Drive(RegisterAccess):
@@ -163,9 +172,9 @@ class Drive(RegisterAccess):
             register.commands or register.access is Access.COMMAND for register in cls.registers.values()
         )
         verbs = any(getattr(cls, name) is not getattr(Drive, name) for name in MOVING)
-        if not (commands or verbs):
+        if not (commands or verbs) or (cls._identifies() and not cls.declared_in):
             return cls.options
-        return {**confirmation(cls.declared_in, identifies=cls._identifies()), **cls.options}
+        return {"confirmed": _CHECKED if cls.declared_in else _CONFIRMED, **cls.options}
 
     @classmethod
     def _identifies(cls) -> bool:
@@ -194,11 +203,8 @@ class Drive(RegisterAccess):
     @classmethod
     def readings(cls) -> tuple[Register[Any], ...]:
         """Return the registers that are polled unless the plant file lists others."""
-        return tuple(
-            register
-            for register in cls.registers.values()
-            if register.access is Access.READING and register.readable
-        )
+        registers = cls.registers.values()
+        return tuple(one for one in registers if one.access is Access.READING and one.readable)
 
     @classmethod
     def speaks(cls, framing: Framing) -> bool:
@@ -236,9 +242,10 @@ class Drive(RegisterAccess):
         self.name = name or f"{self.model or type(self).__name__}@{address}"
         if not (isinstance(self.name, str) and self.name.isprintable()):  # a line break would split a row
             raise ValueError(f"the name {name!r} must be one line of printable characters")
-        self.option = checked_options(self._kind(), self.options, options)
+        self._check_options(options)
+        self.option: Mapping[str, float] = options
         self.ram = frozenset(self._in_ram(name) for name in ram)
-        self._known_setpoint = KnownSetpoint()
+        self._known_setpoint: float | _PendingWrite | None = None
         self.link: Link = NO_LINK
         # one item: the number of stops called so far, which the bus changes
         self.stops_called: Sequence[int] = (0,)
@@ -265,6 +272,19 @@ class Drive(RegisterAccess):
         if register.kept is Kept.EEPROM:
             raise ValueError(f"{name} of {cls._kind()} cannot be in ram: the manual says it is in EEPROM")
         return register.name
+
+    @classmethod
+    def _check_options(cls, given: Mapping[str, float]) -> None:
+        """Raise ValueError for an unknown option or a value outside the option's limits."""
+        for name, value in given.items():
+            if name not in cls.options:
+                known = ", ".join(cls.options) or "none"
+                raise ValueError(f"{cls._kind()} has no option {name!r}; its options: {known}")
+            (low, high), unit = cls.options[name].span, cls.options[name].unit
+            if not is_number(value) or not low <= value <= high:
+                raise ValueError(f"{name} = {value!r} is outside {low:g} to {high:g} {unit}".rstrip())
+            if not unit and value != int(value):
+                raise ValueError(f"{name} = {value!r} is not a whole number from {low:g} to {high:g}")
 
     def take_framing_of(self, port: str) -> None:
         """Use TCP framing on a tcp:// port, else the declared one; raise ValueError if that is impossible."""
@@ -364,25 +384,46 @@ class Drive(RegisterAccess):
         """
         if "confirmed" not in self.options or self.option.get("confirmed"):
             return
-        if why := doubt(self._kind(), self.declared_in, identifies=self._identifies()):
-            raise WriteForbidden(
-                f"{what} is not sent to {self.name}: {why}, then declare confirmed = 1",
-                rule="the drive is not confirmed",
-                advice=Advice.declare("confirmed", 1),
+        if self.declared_in:
+            why = (
+                f"the family file {self.declared_in} is not confirmed for this drive. Compare the output of "
+                f"`multidrop check {self.declared_in}` with the manual, read the drive's name plate"
             )
+        elif not self._identifies():
+            why = (
+                f"its class cannot identify a {self._kind()}, and the write may start a motor on a drive of "
+                "another maker. Read the drive's name plate"
+            )
+        else:
+            return
+        raise WriteForbidden(
+            f"{what} is not sent to {self.name}: {why}, then declare confirmed = 1",
+            rule="the drive is not confirmed",
+            advice=Advice.declare("confirmed", 1),
+        )
 
     @property
     def commanded(self) -> float | None:
         """The setpoint that was written last; None unless the drive is known to hold it."""
-        return self._known_setpoint.value
+        return None if isinstance(self._known_setpoint, _PendingWrite) else self._known_setpoint
 
     @commanded.setter
     def commanded(self, held: float | None) -> None:
-        self._known_setpoint.value = held
+        self._known_setpoint = held
 
     def begin_setpoint(self) -> Callable[[], None]:
-        """Forget the setpoint until its write ends; return a function to restore it if nothing was sent."""
-        return self._known_setpoint.begin_write()
+        """Forget the setpoint until its write ends; return a function that restores it.
+
+        The caller calls that function if the write was not sent or was refused. The function does nothing if
+        another thread has written a setpoint since.
+        """
+        pending = self._known_setpoint = _PendingWrite(self._known_setpoint)
+
+        def restore() -> None:
+            if self._known_setpoint is pending:
+                self._known_setpoint = pending.before
+
+        return restore
 
     # ---- scripts, carried out by the bus ----
 
@@ -557,43 +598,3 @@ TAKEN_NAMES = frozenset(
 def verbs_of(drive: Drive) -> list[str]:
     """Return the names of the verbs that command this drive."""
     return [name for name in VERB_OPTIONS if getattr(type(drive), name) is not getattr(Drive, name)]
-
-
-# ---- checks that a register belongs to the drive's family, because families use addresses differently ----
-
-
-def check_drive(drive: Drive) -> None:
-    """Raise TypeError unless `drive` is a Drive."""
-    if not isinstance(drive, Drive):
-        raise TypeError(f"{drive!r} is not a drive: pass the drive that bus.attach() returned")
-
-
-def check_own(drive: Drive, register: Register[Any]) -> None:
-    """Raise ValueError for a register of another family, TypeError if `register` is not a Register."""
-    check_drive(drive)
-    if not isinstance(register, Register):
-        hint = "pass attributes of the drive, or drive.register(NAME), as separate arguments"
-        raise TypeError(f"{register!r} is not a Register of {drive.name}: {hint}")
-    is_parameter = isinstance(register, Parameter) and isinstance(drive, register.family)
-    if not is_parameter and drive.registers.get(register.name) is not register:
-        raise ValueError(
-            f"this {register.name} is not a register of {drive.name}, which is a {drive._kind()}"
-        )
-
-
-def check_readable(drive: Drive, register: Register[Any]) -> None:
-    """Raise ValueError if the register cannot be read."""
-    if not register.readable:
-        kind = register.access.value
-        raise ValueError(f"{register.name} of {drive.name} cannot be read: it is declared as a {kind}")
-
-
-def check_own_text(drive: Drive, text: Text) -> None:
-    """Raise ValueError for a text register of another family, TypeError if `text` is not a Text."""
-    check_drive(drive)
-    if not isinstance(text, Text):
-        raise TypeError(
-            f"{text!r} is not a Text: use an attribute of {drive.name}, or {drive.name}.texts[NAME]"
-        )
-    if drive.texts.get(text.name) is not text:
-        raise ValueError(f"this {text.name} is not a text of {drive.name}, which is a {drive._kind()}")

@@ -8,8 +8,7 @@ from typing import Any, cast
 
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Register
-from multidrop.drive.state import Condition, State
-from multidrop.drive.verbs import Read
+from multidrop.drive.verbs import Condition, Read, State
 from multidrop.errors import BusError
 
 MOST_STEPS = 20

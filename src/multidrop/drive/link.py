@@ -1,10 +1,14 @@
-"""RegisterAccess: a drive's read and write methods. Link: the methods of a bus that a drive calls."""
+"""RegisterAccess: a drive's read and write methods. Link: the methods of a bus that a drive calls.
+
+The functions at the end check that a register belongs to a drive.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, ClassVar, NoReturn, Protocol, TypeVar, cast, overload
 
+from multidrop.drive.parameters import Parameter
 from multidrop.drive.register import Register
 from multidrop.drive.text import Text
 from multidrop.drive.verbs import CalledStop, Script, UnattachedStop
@@ -73,7 +77,9 @@ class RegisterAccess:
 
     name: str
     link: Link
+    registers: ClassVar[Mapping[str, Register[Any]]]
     texts: ClassVar[Mapping[str, Text]]
+    _kind: Callable[[], str]
     register: Callable[[str], Register[Any]]
     readings: Callable[[], tuple[Register[Any], ...]]
 
@@ -171,3 +177,43 @@ class RegisterAccess:
         `read_raw` sends, such as 1 to 4.
         """
         return self.link.send_raw(self, function, start, data, count)
+
+
+# ---- checks that a register belongs to the drive's family, because families use addresses differently ----
+
+
+def check_drive(drive: RegisterAccess) -> None:
+    """Raise TypeError unless `drive` is a Drive."""
+    if not isinstance(drive, RegisterAccess):
+        raise TypeError(f"{drive!r} is not a drive: pass the drive that bus.attach() returned")
+
+
+def check_own(drive: RegisterAccess, register: Register[Any]) -> None:
+    """Raise ValueError for a register of another family, TypeError if `register` is not a Register."""
+    check_drive(drive)
+    if not isinstance(register, Register):
+        hint = "pass attributes of the drive, or drive.register(NAME), as separate arguments"
+        raise TypeError(f"{register!r} is not a Register of {drive.name}: {hint}")
+    is_parameter = isinstance(register, Parameter) and isinstance(drive, register.family)
+    if not is_parameter and drive.registers.get(register.name) is not register:
+        raise ValueError(
+            f"this {register.name} is not a register of {drive.name}, which is a {drive._kind()}"
+        )
+
+
+def check_readable(drive: RegisterAccess, register: Register[Any]) -> None:
+    """Raise ValueError if the register cannot be read."""
+    if not register.readable:
+        kind = register.access.value
+        raise ValueError(f"{register.name} of {drive.name} cannot be read: it is declared as a {kind}")
+
+
+def check_own_text(drive: RegisterAccess, text: Text) -> None:
+    """Raise ValueError for a text register of another family, TypeError if `text` is not a Text."""
+    check_drive(drive)
+    if not isinstance(text, Text):
+        raise TypeError(
+            f"{text!r} is not a Text: use an attribute of {drive.name}, or {drive.name}.texts[NAME]"
+        )
+    if drive.texts.get(text.name) is not text:
+        raise ValueError(f"this {text.name} is not a text of {drive.name}, which is a {drive._kind()}")

@@ -1,7 +1,7 @@
 """Register: one quantity of a drive, as its manual describes it, and its values in replies and requests.
 
 A `Register[float]` has a unit and a step. A `Register[E]` has the values of the enumeration E. Declare them
-with `reading`, `setting` and `command`.
+with `reading`, `setting` and `command`. Option: a property of a drive that only its owner knows.
 """
 
 from __future__ import annotations
@@ -505,6 +505,18 @@ def _declare(access: Access, address: int, what: Any, given: Details) -> Registe
         details = {**details, "invalid": (details["invalid"],)}
     key = "unit" if isinstance(what, str) else "values"
     return Register(address, access, **{key: what, **details})
+
+
+@dataclass(frozen=True)
+class Option:
+    """A property of a drive that only its owner knows, such as its maximum frequency.
+
+    An option without a unit is a whole number.
+    """
+
+    unit: str
+    span: tuple[float, float]
+    meaning: str
 
 
 def row_field(register: Register[Any], at: int, code: int) -> Field:

@@ -1,4 +1,4 @@
-"""Verbs: a drive's commands, such as `start`. No I/O.
+"""Verbs: a drive's commands, such as `start`, and their results, such as the drive's state. No I/O.
 
 The script of a verb is a generator; the drive's bus carries out its steps.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass
-from enum import StrEnum
+from enum import Enum, StrEnum
 from inspect import Parameter, Signature, signature
 from numbers import Real
 from sys import float_info
@@ -25,7 +25,6 @@ from typing import (
 )
 
 from multidrop.drive.register import Register
-from multidrop.drive.state import Direction
 from multidrop.drive.text import Text
 from multidrop.errors import BadReply, BusError, DriveException, NoReply, Unconfirmed
 from multidrop.printable import is_number
@@ -145,6 +144,40 @@ def until(look: Callable[[], Script[bool]], *, limit: float, every: float = 0.1)
 
 
 # ---- results ----
+
+
+class Direction(Enum):
+    FORWARD = "forward"
+    REVERSE = "reverse"
+
+
+class Condition(Enum):
+    STOPPED = "stopped"
+    RUNNING = "running"
+    ACCELERATING = "accelerating"
+    DECELERATING = "decelerating"
+    FAULT = "fault"
+    UNKNOWN = "unknown"  # the drive cannot report its state; never treat it as stopped
+
+
+@dataclass(frozen=True)
+class State:
+    """A drive's state. Attributes that the drive's document does not define have no value."""
+
+    condition: Condition
+    direction: Direction | None = None
+    fault: str | None = None
+    note: str = ""
+
+    def __str__(self) -> str:
+        words = [self.condition.value]
+        if self.direction:
+            words.append(self.direction.value)
+        if self.fault:
+            words.append(f"({self.fault})")
+        if self.note:
+            words.append(f"- {self.note}")
+        return " ".join(words)
 
 
 class CommandOutcome(StrEnum):

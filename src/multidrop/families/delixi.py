@@ -8,12 +8,12 @@ from enum import IntEnum
 from typing import Any
 
 from multidrop.drive import Drive, Framing, NotVerified, WriteForbidden
-from multidrop.drive.options import Option
 from multidrop.drive.parameters import ParameterGroup, ParameterSpace
 from multidrop.drive.register import (
     HOLDING,
     Carrier,
     Kept,
+    Option,
     Register,
     Table,
     Worded,
@@ -21,8 +21,7 @@ from multidrop.drive.register import (
     reading,
     setting,
 )
-from multidrop.drive.state import Condition, Direction, State
-from multidrop.drive.verbs import Script, insist, read, verb, write
+from multidrop.drive.verbs import Condition, Direction, Script, State, insist, read, verb, write
 
 # s; default limit of a stop: the manual does not say which parameter is the deceleration time
 STOP_TIME = 60.0

@@ -7,21 +7,20 @@ from typing import Any, Unpack
 
 from multidrop.drive import Advice, BusError, Drive, DriveException, Unconfirmed, WriteForbidden
 from multidrop.drive.number_format import NumberFormat
-from multidrop.drive.options import Option
 from multidrop.drive.parameters import ParameterSpace
 from multidrop.drive.register import (
     COIL,
     HOLDING,
     INPUT,
     Details,
+    Option,
     Register,
     command,
     declaration,
     reading,
     setting,
 )
-from multidrop.drive.state import Condition, Direction, State
-from multidrop.drive.verbs import Script, insist, read, verb, write
+from multidrop.drive.verbs import Condition, Direction, Script, State, insist, read, verb, write
 
 STOP_MARGIN = 5.0  # seconds that a stop may take in addition to the deceleration time
 UNKNOWN_RAMP = 30.0  # seconds allowed for a stop if the deceleration time cannot be read

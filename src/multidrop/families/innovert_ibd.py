@@ -9,11 +9,9 @@ from typing import Any
 
 from multidrop.drive import Advice, BusError, Drive, DriveException, Framing, Unconfirmed, WriteForbidden
 from multidrop.drive.declaration_check import DeclarationError
-from multidrop.drive.options import Option
 from multidrop.drive.parameters import ParameterGroup, ParameterSpace
-from multidrop.drive.register import HOLDING, Register, command, reading, setting
-from multidrop.drive.state import Condition, Direction, State
-from multidrop.drive.verbs import Script, insist, read, verb, write
+from multidrop.drive.register import HOLDING, Option, Register, command, reading, setting
+from multidrop.drive.verbs import Condition, Direction, Script, State, insist, read, verb, write
 
 STOP_MARGIN = 5.0  # seconds that a stop may take in addition to the deceleration time
 

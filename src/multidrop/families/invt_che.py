@@ -16,11 +16,11 @@ from multidrop.drive import (
     WriteForbidden,
 )
 from multidrop.drive.number_format import NumberFormat
-from multidrop.drive.options import Option
 from multidrop.drive.register import (
     HOLDING,
     Details,
     Kept,
+    Option,
     Register,
     Worded,
     command,
@@ -28,8 +28,7 @@ from multidrop.drive.register import (
     reading,
     setting,
 )
-from multidrop.drive.state import Condition, Direction, State
-from multidrop.drive.verbs import Script, insist, read, verb, write
+from multidrop.drive.verbs import Condition, Direction, Script, State, insist, read, verb, write
 
 CHE100 = "CHE100 manual v1.4, p. 117"
 CHE100_NEXT = "CHE100 manual v1.4, p. 118"

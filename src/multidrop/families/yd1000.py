@@ -9,11 +9,21 @@ from enum import IntEnum, IntFlag
 from typing import Any, Unpack
 
 from multidrop.drive import BusError, Drive, DriveException, NotVerified, Unconfirmed, WriteForbidden
-from multidrop.drive.options import Option
 from multidrop.drive.parameters import ParameterGroup, ParameterSpace
-from multidrop.drive.register import HOLDING, Details, Kept, Register, command, reading, setting
-from multidrop.drive.state import Condition, Direction, State
-from multidrop.drive.verbs import Pulse, Script, insist, read, until, verb, wait, write
+from multidrop.drive.register import HOLDING, Details, Kept, Option, Register, command, reading, setting
+from multidrop.drive.verbs import (
+    Condition,
+    Direction,
+    Pulse,
+    Script,
+    State,
+    insist,
+    read,
+    until,
+    verb,
+    wait,
+    write,
+)
 
 STOP_MARGIN = 5.0  # seconds that a stop may take in addition to the deceleration time
 SELECTION_TIME = 1.0  # seconds within which register 1202H must show a newly selected preset speed

@@ -20,7 +20,7 @@ from multidrop.control.rules import check_plain, raw_count
 from multidrop.drive.family import Drive
 from multidrop.drive.parameters import Parameter, parameters_of
 from multidrop.drive.register import Register
-from multidrop.drive.state import Condition
+from multidrop.drive.verbs import Condition
 from multidrop.errors import Advice, BusError, CancelledByStop, Unsupported, WriteForbidden
 from multidrop.params.values import ParameterSet, Progress, check_same_model, parameter_of, read, text_of
 from multidrop.printable import format_time

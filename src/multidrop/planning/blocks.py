@@ -10,7 +10,8 @@ from itertools import accumulate
 from typing import Any
 
 from multidrop.core import Framing, Message
-from multidrop.drive.family import Drive, check_readable
+from multidrop.drive.family import Drive
+from multidrop.drive.link import check_readable
 from multidrop.drive.register import Carrier, Register, Table
 from multidrop.drive.request import may_be_crossed, read_limit, read_request, stated_limit
 from multidrop.drive.text import Text

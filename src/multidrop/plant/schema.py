@@ -10,7 +10,7 @@ from multidrop.core import Framing
 from multidrop.drive import Kept
 from multidrop.drive.family import Drive
 from multidrop.drive.line_settings import SERIAL_ADDRESSES
-from multidrop.drive.options import Option
+from multidrop.drive.register import Option
 from multidrop.drive.verbs import LISTED_VERBS
 from multidrop.families import MODELS
 from multidrop.families.registry import SHIPPED, installed_models, shipped_family

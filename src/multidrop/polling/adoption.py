@@ -14,8 +14,9 @@ from typing import Any
 
 from multidrop.bus import Bus
 from multidrop.control.exit_hook import exit_hook
-from multidrop.drive.family import Drive, check_own, check_readable
+from multidrop.drive.family import Drive
 from multidrop.drive.line_settings import speaks_tcp
+from multidrop.drive.link import check_own, check_readable
 from multidrop.drive.register import Register
 from multidrop.errors import LineError
 from multidrop.plant.loader import PlantError

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 from multidrop.bus import Bus
 from multidrop.core import Exchange, Names, Port, RowLayout
-from multidrop.drive.family import Drive, check_own
+from multidrop.drive.family import Drive
+from multidrop.drive.link import check_own
 from multidrop.drive.register import row_field
 from multidrop.planning.blocks import Block, Plan, may_be_too_long, plan, sending
 from multidrop.planning.bus_time import kind, silence

@@ -13,8 +13,7 @@ from multidrop.control.ramp import check_worn
 from multidrop.control.rules import check_plain, conditions, raw_count, refused, wears
 from multidrop.drive.family import Drive
 from multidrop.drive.register import Kept
-from multidrop.drive.state import Direction
-from multidrop.drive.verbs import Write
+from multidrop.drive.verbs import Direction, Write
 from multidrop.errors import Unsupported
 from multidrop.planning.prediction import Prediction, duration_text, predict, suggest
 from multidrop.plant.model import Plant, PlantLine, planned_on

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from multidrop.drive.family import Drive
-from multidrop.drive.state import Direction
+from multidrop.drive.verbs import Direction
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import Plant
 from multidrop.printable import is_number

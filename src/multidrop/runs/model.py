@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from multidrop.drive.known_state import FAULT
-from multidrop.drive.state import Direction
+from multidrop.drive.verbs import Direction
 from multidrop.plant.model import Plant, PolledDrive
 from multidrop.printable import plain_number
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from multidrop.drive.known_state import FAULT, FAULT_RECORDS, StateReader
-from multidrop.drive.state import Condition
+from multidrop.drive.verbs import Condition
 from multidrop.polling.batch import Row
 from multidrop.runs.model import ReadingCondition, RunPlan, polled_drive
 

@@ -6,8 +6,8 @@ from functools import lru_cache
 from typing import Any
 
 from multidrop.core import Completion, Exchange, Message, Peer, RowLayout
-from multidrop.drive.family import Drive, check_own
-from multidrop.drive.link import TextWanted
+from multidrop.drive.family import Drive
+from multidrop.drive.link import TextWanted, check_own
 from multidrop.drive.number_format import FLOATS
 from multidrop.drive.register import Register, row_field
 from multidrop.drive.text import Text

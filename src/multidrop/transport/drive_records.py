@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from multidrop.core import Completion, Exchange, Framing, Peer, TransactionIds, is_pseudo_terminal
-from multidrop.drive.family import Drive, check_drive
+from multidrop.drive.family import Drive
+from multidrop.drive.link import check_drive
 from multidrop.errors import NotAttached
 from multidrop.planning.bus_time import silence
 from multidrop.planning.proofs import proofs

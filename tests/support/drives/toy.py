@@ -6,8 +6,7 @@ from typing import Any
 
 from multidrop.core import Message
 from multidrop.drive import Condition, Direction, Drive, Framing, Script, State, read, write
-from multidrop.drive.options import Option
-from multidrop.drive.register import HOLDING, Kept, command, reading, setting
+from multidrop.drive.register import HOLDING, Kept, Option, command, reading, setting
 from multidrop.drive.verbs import verb
 from multidrop.sim import SimulatedDrive
 from multidrop.sim.drive import Reason, Refusal

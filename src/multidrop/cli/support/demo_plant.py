@@ -18,7 +18,7 @@ from typing import Any, Self
 from multidrop.bus import Bus
 from multidrop.cli import main
 from multidrop.drive.family import Drive
-from multidrop.drive.state import Condition
+from multidrop.drive.verbs import Condition
 from multidrop.errors import BusError
 from multidrop.families.registry import find_model
 from multidrop.plant.loader import load_plant

@@ -19,7 +19,7 @@ from multidrop.cli.support.terminal import sparkline
 from multidrop.cli.support.values import columns_of, padded, value_text
 from multidrop.core import UNASKED, Counters
 from multidrop.drive.known_state import StateReader
-from multidrop.drive.state import Condition, Direction
+from multidrop.drive.verbs import Condition, Direction
 from multidrop.plant.model import Plant, PlantLine, PolledDrive, current_for
 from multidrop.plant.triggers import POST_S, PRE_S, TriggerSeries, with_triggers
 from multidrop.poller import Poller

@@ -14,9 +14,8 @@ from multidrop.core import Framing
 from multidrop.drive.declaration_check import UNIT_IDS
 from multidrop.drive.family import TAKEN_NAMES, Drive
 from multidrop.drive.line_settings import BAUDRATES, FORMAT, LONGEST_SILENCE, Settings
-from multidrop.drive.options import Option
 from multidrop.drive.parameters import ParameterGroup, ParameterSpace
-from multidrop.drive.register import Register, Table
+from multidrop.drive.register import Option, Register, Table
 from multidrop.drive.request import LONGEST_INTERVAL, STANDARD_LIMITS
 from multidrop.drive.text import Text, text
 from multidrop.drive.verbs import Script, Verb, read, verb

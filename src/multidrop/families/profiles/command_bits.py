@@ -12,8 +12,7 @@ from typing import ClassVar
 
 from multidrop.drive import NotVerified, WriteForbidden
 from multidrop.drive.register import Access
-from multidrop.drive.state import Condition, Direction
-from multidrop.drive.verbs import Script, insist, until, wait, write
+from multidrop.drive.verbs import Condition, Direction, Script, insist, until, wait, write
 from multidrop.families.profiles.profile import COMMON, Profile, Role
 
 READY_TIME = 1.0  # seconds allowed for each state change before the start word is sent

@@ -12,8 +12,7 @@ from typing import Any, ClassVar, cast
 
 from multidrop.drive import BusError, DriveException, WriteForbidden
 from multidrop.drive.register import Access
-from multidrop.drive.state import Condition, Direction
-from multidrop.drive.verbs import Script, insist, read, verb, write
+from multidrop.drive.verbs import Condition, Direction, Script, insist, read, verb, write
 from multidrop.families.profiles.profile import COMMON, READING, Profile, Role
 
 # ---- Delta ----

@@ -19,10 +19,8 @@ from multidrop.drive import (
 )
 from multidrop.drive.declaration_check import DeclarationError
 from multidrop.drive.number_format import NumberFormat
-from multidrop.drive.options import Option
-from multidrop.drive.register import Access, Carrier, Register
-from multidrop.drive.state import Condition, Direction, State
-from multidrop.drive.verbs import Script, insist, read, until, verb, write
+from multidrop.drive.register import Access, Carrier, Option, Register
+from multidrop.drive.verbs import Condition, Direction, Script, State, insist, read, until, verb, write
 
 _BY_PROFILE = "set by the profile; leave it out"
 
