@@ -17,7 +17,8 @@ from tables import table
 
 from multidrop.cli import COMMANDS, main
 from multidrop.cli.fleet import ACTIONS as FLEET
-from multidrop.drive import Advice, WriteForbidden, carry_out
+from multidrop.drive import carry_out
+from multidrop.errors import Advice, WriteForbidden
 from multidrop.families import ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.recording import open_writer
 

@@ -18,7 +18,7 @@ from tables import examples, table
 
 from multidrop import Condition
 from multidrop.core import Message, NumberFormat
-from multidrop.drive import Drive, StateReader, WriteForbidden, chosen_language
+from multidrop.drive import Drive, StateReader, chosen_language
 from multidrop.drive.declaration_check import DeclarationError
 from multidrop.drive.line_settings import Settings
 from multidrop.drive.register import (
@@ -34,6 +34,7 @@ from multidrop.drive.register import (
 )
 from multidrop.drive.text import Text, text
 from multidrop.drive.verbs import Script, State, read, verb
+from multidrop.errors import WriteForbidden
 from multidrop.families import MODELS
 from multidrop.families.registry import SHIPPED, shipped_family
 from multidrop.scan.scanner import _read

@@ -29,10 +29,11 @@ from multidrop.core import (
     parse_request,
     raw_value,
 )
-from multidrop.drive import Condition, Direction, Drive, State, Unsupported
+from multidrop.drive import Condition, Direction, Drive, State
 from multidrop.drive.register import Access, Carrier, Register, reading
 from multidrop.drive.request import write_request
 from multidrop.drive.verbs import VERBS
+from multidrop.errors import Unsupported
 from multidrop.families import MODELS, DelixiModbus, DelixiNative
 from multidrop.families.invt_che import CHEStatus
 from multidrop.planning.blocks import blocks

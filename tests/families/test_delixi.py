@@ -10,9 +10,9 @@ from simulated_bus import one
 from tables import table
 
 from multidrop.control.eeprom_ledger import Ledger
-from multidrop.drive import Condition, Direction, Framing, NotVerified, State, Unconfirmed, WriteForbidden
+from multidrop.drive import Condition, Direction, Framing, State
 from multidrop.drive.register import HOLDING, Carrier, Kept, setting
-from multidrop.errors import NoReply
+from multidrop.errors import NoReply, NotVerified, Unconfirmed, WriteForbidden
 from multidrop.families.delixi import (
     PARAMETER,
     PARAMETER_RAM,

@@ -9,17 +9,17 @@ from simulated_bus import one
 from tables import table
 
 from multidrop.core import NumberFormat
-from multidrop.drive import (
-    Condition,
-    Direction,
+from multidrop.drive import Condition, Direction
+from multidrop.drive.register import COIL, HOLDING, INPUT, Kept
+from multidrop.errors import (
+    BadReply,
     DriveException,
+    NoReply,
     NotVerified,
     Unconfirmed,
     Unsupported,
     WriteForbidden,
 )
-from multidrop.drive.register import COIL, HOLDING, INPUT, Kept
-from multidrop.errors import BadReply, NoReply
 from multidrop.families.erman_er_g_220 import Coil, ErmanERG220, ErmanFault, ErmanStatus, Modes
 
 START_ON = "01 05 00 00 FF 00 8C 3A"  # printed in section 7 of the manual

@@ -8,10 +8,10 @@ from scripts import Wire, frame, rows, typed
 from simulated_bus import one
 from tables import table
 
-from multidrop.drive import Condition, Direction, DriveException, Framing, Unconfirmed, WriteForbidden
+from multidrop.drive import Condition, Direction, Framing
 from multidrop.drive.declaration_check import DeclarationError
 from multidrop.drive.register import HOLDING, reading
-from multidrop.errors import NoReply
+from multidrop.errors import DriveException, NoReply, Unconfirmed, WriteForbidden
 from multidrop.families.innovert_ibd import (
     FrequencySource,
     IBDBaudrate,

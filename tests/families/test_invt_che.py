@@ -12,17 +12,17 @@ from tables import table
 
 from multidrop.control.eeprom_ledger import Ledger
 from multidrop.core import NumberFormat
-from multidrop.drive import (
-    Condition,
-    Direction,
+from multidrop.drive import Condition, Direction, State
+from multidrop.drive.register import HOLDING, Kept
+from multidrop.errors import (
+    BadReply,
+    BusError,
     DriveException,
+    NoReply,
     NotVerified,
-    State,
     Unconfirmed,
     WriteForbidden,
 )
-from multidrop.drive.register import HOLDING, Kept
-from multidrop.errors import BadReply, BusError, NoReply
 from multidrop.families.invt_che import (
     CHEControl,
     CHEFault,

@@ -14,8 +14,8 @@ from simulated_bus import SimulatedBus, is_write
 from tables import table, usually
 
 from multidrop.core import Framing, Message, build_reply
-from multidrop.drive import ANOTHER_FAMILY, Drive
-from multidrop.errors import BusError, DriveException, NoReply, Unconfirmed, WriteForbidden
+from multidrop.drive import Drive
+from multidrop.errors import ANOTHER_FAMILY, BusError, DriveException, NoReply, Unconfirmed, WriteForbidden
 from multidrop.families import MODELS, YD1000, DelixiModbus, ErmanERG220, InnovertIBD, InvtCHE
 from multidrop.families.registry import RECOGNISABLE, shipped_family
 from multidrop.scan.scanner import identify

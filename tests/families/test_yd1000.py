@@ -8,19 +8,17 @@ from scripts import Wire, frame, rows, typed
 from simulated_bus import one
 from tables import table
 
-from multidrop.drive import (
-    Condition,
-    Direction,
+from multidrop.drive import Condition, Direction, State, write
+from multidrop.drive.register import HOLDING, Kept
+from multidrop.errors import (
     DriveException,
+    Expired,
+    NoReply,
     NotVerified,
-    State,
     Unconfirmed,
     Unsupported,
     WriteForbidden,
-    write,
 )
-from multidrop.drive.register import HOLDING, Kept
-from multidrop.errors import Expired, NoReply
 from multidrop.families import DelixiModbus
 from multidrop.families.yd1000 import YD1000, Inputs, Outputs, YD1000Control, YD1000Status, extended
 from multidrop.sim.families import SimulatedYD1000

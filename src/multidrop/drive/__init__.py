@@ -40,11 +40,3 @@ from multidrop.drive.verbs import verb as verb
 from multidrop.drive.verbs import verb_arguments as verb_arguments
 from multidrop.drive.verbs import wait as wait
 from multidrop.drive.verbs import write as write
-from multidrop.errors import ANOTHER_FAMILY as ANOTHER_FAMILY
-from multidrop.errors import Advice as Advice
-from multidrop.errors import BusError as BusError
-from multidrop.errors import DriveException as DriveException
-from multidrop.errors import NotVerified as NotVerified
-from multidrop.errors import Unconfirmed as Unconfirmed
-from multidrop.errors import Unsupported as Unsupported
-from multidrop.errors import WriteForbidden as WriteForbidden

@@ -7,7 +7,7 @@ from dataclasses import replace
 from enum import IntEnum
 from typing import Any
 
-from multidrop.drive import Drive, Framing, NotVerified, WriteForbidden
+from multidrop.drive import Condition, Direction, Drive, Framing, State
 from multidrop.drive.parameters import ParameterGroup, ParameterSpace
 from multidrop.drive.register import (
     HOLDING,
@@ -21,7 +21,8 @@ from multidrop.drive.register import (
     reading,
     setting,
 )
-from multidrop.drive.verbs import Condition, Direction, Script, State, insist, read, verb, write
+from multidrop.drive.verbs import Script, insist, read, verb, write
+from multidrop.errors import NotVerified, WriteForbidden
 
 # s; default limit of a stop: the manual does not say which parameter is the deceleration time
 STOP_TIME = 60.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import IntEnum, IntFlag
 from typing import Any, Unpack
 
-from multidrop.drive import Advice, BusError, Drive, DriveException, Unconfirmed, WriteForbidden
+from multidrop.drive import Condition, Direction, Drive, State
 from multidrop.drive.number_format import NumberFormat
 from multidrop.drive.parameters import ParameterSpace
 from multidrop.drive.register import (
@@ -20,7 +20,8 @@ from multidrop.drive.register import (
     reading,
     setting,
 )
-from multidrop.drive.verbs import Condition, Direction, Script, State, insist, read, verb, write
+from multidrop.drive.verbs import Script, insist, read, verb, write
+from multidrop.errors import Advice, BusError, DriveException, Unconfirmed, WriteForbidden
 
 STOP_MARGIN = 5.0  # seconds that a stop may take in addition to the deceleration time
 UNKNOWN_RAMP = 30.0  # seconds allowed for a stop if the deceleration time cannot be read

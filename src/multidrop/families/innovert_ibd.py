@@ -7,11 +7,12 @@ from contextlib import suppress
 from enum import IntEnum, IntFlag
 from typing import Any
 
-from multidrop.drive import Advice, BusError, Drive, DriveException, Framing, Unconfirmed, WriteForbidden
+from multidrop.drive import Condition, Direction, Drive, Framing, State
 from multidrop.drive.declaration_check import DeclarationError
 from multidrop.drive.parameters import ParameterGroup, ParameterSpace
 from multidrop.drive.register import HOLDING, Option, Register, command, reading, setting
-from multidrop.drive.verbs import Condition, Direction, Script, State, insist, read, verb, write
+from multidrop.drive.verbs import Script, insist, read, verb, write
+from multidrop.errors import Advice, BusError, DriveException, Unconfirmed, WriteForbidden
 
 STOP_MARGIN = 5.0  # seconds that a stop may take in addition to the deceleration time
 

@@ -6,15 +6,7 @@ from contextlib import suppress
 from enum import IntEnum
 from typing import Any, Unpack
 
-from multidrop.drive import (
-    ANOTHER_FAMILY,
-    Advice,
-    BusError,
-    Drive,
-    DriveException,
-    NotVerified,
-    WriteForbidden,
-)
+from multidrop.drive import Condition, Direction, Drive, State
 from multidrop.drive.number_format import NumberFormat
 from multidrop.drive.register import (
     HOLDING,
@@ -28,7 +20,8 @@ from multidrop.drive.register import (
     reading,
     setting,
 )
-from multidrop.drive.verbs import Condition, Direction, Script, State, insist, read, verb, write
+from multidrop.drive.verbs import Script, insist, read, verb, write
+from multidrop.errors import ANOTHER_FAMILY, Advice, BusError, DriveException, NotVerified, WriteForbidden
 
 CHE100 = "CHE100 manual v1.4, p. 117"
 CHE100_NEXT = "CHE100 manual v1.4, p. 118"

@@ -8,22 +8,11 @@ from contextlib import suppress
 from enum import IntEnum, IntFlag
 from typing import Any, Unpack
 
-from multidrop.drive import BusError, Drive, DriveException, NotVerified, Unconfirmed, WriteForbidden
+from multidrop.drive import Condition, Direction, Drive, State
 from multidrop.drive.parameters import ParameterGroup, ParameterSpace
 from multidrop.drive.register import HOLDING, Details, Kept, Option, Register, command, reading, setting
-from multidrop.drive.verbs import (
-    Condition,
-    Direction,
-    Pulse,
-    Script,
-    State,
-    insist,
-    read,
-    until,
-    verb,
-    wait,
-    write,
-)
+from multidrop.drive.verbs import Pulse, Script, insist, read, until, verb, wait, write
+from multidrop.errors import BusError, DriveException, NotVerified, Unconfirmed, WriteForbidden
 
 STOP_MARGIN = 5.0  # seconds that a stop may take in addition to the deceleration time
 SELECTION_TIME = 1.0  # seconds within which register 1202H must show a newly selected preset speed

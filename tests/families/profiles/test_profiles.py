@@ -15,20 +15,11 @@ from tables import table
 
 from multidrop import Bus, load_family
 from multidrop.core import NumberFormat
-from multidrop.drive import (
-    Condition,
-    Direction,
-    Drive,
-    DriveException,
-    NotVerified,
-    State,
-    Unconfirmed,
-    Unsupported,
-    WriteForbidden,
-)
+from multidrop.drive import Condition, Direction, Drive, State
 from multidrop.drive.declaration_check import DeclarationError
 from multidrop.drive.register import COIL, Register, command, reading, setting
 from multidrop.drive.verbs import VERBS
+from multidrop.errors import DriveException, NotVerified, Unconfirmed, Unsupported, WriteForbidden
 from multidrop.families.profiles import PROFILES, Delta
 from multidrop.sim import SimulatedDrive, Simulator, simulated
 from multidrop.sim import Wire as SimulatedWire

@@ -18,8 +18,9 @@ from tables import table
 
 from multidrop import Plant
 from multidrop.cli import main
-from multidrop.drive import Drive, Unsupported, WriteForbidden
+from multidrop.drive import Drive
 from multidrop.drive.register import Access, Register
+from multidrop.errors import Unsupported, WriteForbidden
 from multidrop.families import MODELS, YD1000
 from multidrop.families.profiles import PROFILES, Profile
 from multidrop.families.registry import GROUP, SHIPPED, find_model, shipped_family

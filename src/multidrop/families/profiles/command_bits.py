@@ -10,9 +10,10 @@ from enum import IntFlag
 from functools import partial
 from typing import ClassVar
 
-from multidrop.drive import NotVerified, WriteForbidden
+from multidrop.drive import Condition, Direction
 from multidrop.drive.register import Access
-from multidrop.drive.verbs import Condition, Direction, Script, insist, until, wait, write
+from multidrop.drive.verbs import Script, insist, until, wait, write
+from multidrop.errors import NotVerified, WriteForbidden
 from multidrop.families.profiles.profile import COMMON, Profile, Role
 
 READY_TIME = 1.0  # seconds allowed for each state change before the start word is sent

@@ -10,9 +10,10 @@ from contextlib import suppress
 from enum import IntEnum, IntFlag
 from typing import Any, ClassVar, cast
 
-from multidrop.drive import BusError, DriveException, WriteForbidden
+from multidrop.drive import Condition, Direction
 from multidrop.drive.register import Access
-from multidrop.drive.verbs import Condition, Direction, Script, insist, read, verb, write
+from multidrop.drive.verbs import Script, insist, read, verb, write
+from multidrop.errors import BusError, DriveException, WriteForbidden
 from multidrop.families.profiles.profile import COMMON, READING, Profile, Role
 
 # ---- Delta ----

@@ -8,19 +8,12 @@ from enum import IntEnum, IntFlag
 from itertools import chain
 from typing import Any, ClassVar, cast
 
-from multidrop.drive import (
-    ANOTHER_FAMILY,
-    Advice,
-    Drive,
-    DriveException,
-    NotVerified,
-    Unconfirmed,
-    WriteForbidden,
-)
+from multidrop.drive import Condition, Direction, Drive, State
 from multidrop.drive.declaration_check import DeclarationError
 from multidrop.drive.number_format import NumberFormat
 from multidrop.drive.register import Access, Carrier, Option, Register
-from multidrop.drive.verbs import Condition, Direction, Script, State, insist, read, until, verb, write
+from multidrop.drive.verbs import Script, insist, read, until, verb, write
+from multidrop.errors import ANOTHER_FAMILY, Advice, DriveException, NotVerified, Unconfirmed, WriteForbidden
 
 _BY_PROFILE = "set by the profile; leave it out"
 
