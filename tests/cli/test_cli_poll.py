@@ -25,8 +25,8 @@ from toy import Toy
 
 from multidrop.bus import Bus
 from multidrop.capture import Capture, Decoding
-from multidrop.cli.support import demo_plant
-from multidrop.cli.support.demo_plant import DRIVES, Operator
+from multidrop.cli import simulate as simulate_command
+from multidrop.cli.simulate import DRIVES, Operator
 from multidrop.core import Message, Status
 from multidrop.errors import NoReply
 from multidrop.families import MODELS, InvtCHE
@@ -37,7 +37,7 @@ OUT = ("--out", "a.arrows")
 SIMULATING = """
 import sys, time
 from pathlib import Path
-from multidrop.cli.support.demo_plant import simulator
+from multidrop.cli.simulate import simulator
 with simulator(Path(sys.argv[1]), Path(sys.argv[2])):
     print("ready", flush=True)
     time.sleep(600)
@@ -430,7 +430,7 @@ def framings_of(model: str) -> list[str]:
 @pytest.mark.slow
 def test_the_demos_simulated_operator_never_restarts_a_stopped_motor(monkeypatch: pytest.MonkeyPatch) -> None:
     """The operator skips a silent drive, and restarts a motor after a trip."""
-    monkeypatch.setattr(demo_plant, "STEP_S", 0.05)
+    monkeypatch.setattr(simulate_command, "STEP_S", 0.05)
     sims: list[Any] = [simulated(InvtCHE(address, maximum_frequency=50)) for address in (1, 2, 3)]
     sims[0].deaf_until = math.inf
     stopped, tripped = sims[1].motor, sims[2].motor

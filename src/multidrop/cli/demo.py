@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 from multidrop.cli.monitor import watch
 from multidrop.cli.poll import add_polling_arguments, conclude, follow, tap_text
-from multidrop.cli.support.demo_plant import DRIVES, Operator, demo_files, simulator
+from multidrop.cli.simulate import DRIVES, Operator, demo_files, simulator
 from multidrop.cli.support.files import refuse_overwriting
 from multidrop.cli.support.output import command_line, print_text
 from multidrop.cli.support.terminal import keys_are_readable

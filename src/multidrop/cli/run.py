@@ -20,7 +20,6 @@ from multidrop.cli.support.arguments import (
     add_writing_arguments,
     ports_of,
 )
-from multidrop.cli.support.demo_plant import simulator
 from multidrop.cli.support.files import refuse_overwriting
 from multidrop.cli.support.output import confirm, print_json, print_text, warn
 from multidrop.cli.support.values import aligned, counted
@@ -65,6 +64,8 @@ def run(arguments: argparse.Namespace) -> int:
     with ExitStack() as stack:
         ports = ports_of(arguments)
         if arguments.simulate:
+            from multidrop.cli.simulate import simulator  # imports the simulator
+
             folder = Path(stack.enter_context(TemporaryDirectory(prefix="multidrop-")))
             ports = stack.enter_context(simulator(test.plan.plant.path, folder, speed=arguments.speed))
         else:

@@ -16,7 +16,6 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from multidrop.cli.support.arguments import add_port_option, plant_of
-from multidrop.cli.support.demo_plant import Operator, demo_files, simulator
 from multidrop.cli.support.files import require_extra, write_new
 from multidrop.cli.support.log_thread import LogThread, add_log_argument, logging_to_stderr
 from multidrop.cli.support.output import print_text, warn
@@ -106,6 +105,8 @@ def _write_modbus_map(plant: Plant, settings: ServeSettings, path: Path) -> int:
 
 def serve_demo(*, is_shown: bool = True, log: str = "text") -> int:
     """Serve a simulated plant; every user of this computer has all rights."""
+    from multidrop.cli.simulate import Operator, demo_files, simulator  # imports the simulator
+
     _require_server()
     with TemporaryDirectory(prefix="multidrop-") as directory:
         folder = Path(directory)
