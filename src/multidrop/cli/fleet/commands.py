@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from multidrop.cli import STOPS
-from multidrop.cli.fleet.connection import (
+from multidrop.cli.fleet import (
     STATE,
     add_server_arguments,
     nats_options,

@@ -24,7 +24,7 @@ from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any
 
-from multidrop.cli.fleet.connection import CA, CREDENTIALS, require_fleet
+from multidrop.cli.fleet import CA, CREDENTIALS, require_fleet
 from multidrop.cli.fleet.views import drawing, follow
 from multidrop.cli.support.output import print_text
 from multidrop.cli.support.signals import end_signals_cancel

@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from multidrop.cli.fleet.connection import (
+from multidrop.cli.fleet import (
     STATE,
     add_address_arguments,
     add_server_arguments,

@@ -9,7 +9,7 @@ import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from multidrop.cli.fleet.connection import (
+from multidrop.cli.fleet import (
     URLS,
     add_nats_arguments,
     nats_options,

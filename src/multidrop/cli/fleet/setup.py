@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from multidrop.cli.fleet.connection import add_server_arguments, nats_urls, require_fleet, run_with_paths
+from multidrop.cli.fleet import add_server_arguments, nats_urls, require_fleet, run_with_paths
 from multidrop.cli.fleet.views import size
 from multidrop.cli.support.files import require_extra
 from multidrop.cli.support.output import print_json, print_text, warn

@@ -18,7 +18,7 @@ from functools import partial
 from math import inf
 from typing import TYPE_CHECKING, Any
 
-from multidrop.cli.fleet.connection import add_server_arguments, open_path, run_with_paths
+from multidrop.cli.fleet import add_server_arguments, open_path, run_with_paths
 from multidrop.cli.support.output import print_json, print_text
 from multidrop.cli.support.signals import on_end_signals
 from multidrop.cli.support.terminal import Screen, TextLine, cut
