@@ -23,7 +23,7 @@ from peers import require_module
 
 from multidrop import Plant
 from multidrop.cli import main
-from multidrop.cli.fleet import gateway, hub
+from multidrop.cli.fleet import services
 from multidrop.cli.support import log_thread, polling
 from multidrop.cli.support.files import write_new
 from multidrop.cli.support.log_thread import LogThread
@@ -131,13 +131,13 @@ def test_a_fleet_gateway_never_waits_for_log_output(monkeypatch: pytest.MonkeyPa
         logging.getLogger("multidrop.fleet").warning("a stop of pump-1")
         return 7
 
-    monkeypatch.setattr(gateway, "_serve", work)
+    monkeypatch.setattr(services, "_serve", work)
     monkeypatch.setattr(log_thread, "ENDING_S", 0.05)
     unread, log = os.pipe()
     with os.fdopen(unread) as reader, os.fdopen(log, "w") as stream:
         fill(log)
         monkeypatch.setattr(sys, "stderr", stream)
-        assert gateway.run(argparse.Namespace(command="serve", log="text")) == 7
+        assert services.run(argparse.Namespace(command="serve", log="text")) == 7
         assert reader.readline().strip().endswith(" warning a stop of pump-1")
 
 
@@ -152,7 +152,7 @@ def test_the_log_of_a_fleet_has_time_and_level_in_text_and_json(
         logging.getLogger("multidrop.fleet").warning("line %s is lost\x1b", "hall-1")
         return HubState(0, 0, 0, 0, 0, 0, None) if command == "hub" else 0
 
-    monkeypatch.setattr(*((hub, "_read") if command == "hub" else (gateway, "_serve")), work)
+    monkeypatch.setattr(services, "_read" if command == "hub" else "_serve", work)
     for form in ("text", "json"):
         words = ["hub", "--parquet", str(tmp_path)] if command == "hub" else ["fleet", "serve", "gw-1"]
         assert main([*words, "--log", form]) == 0

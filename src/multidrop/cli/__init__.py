@@ -51,7 +51,7 @@ COMMANDS = {  # each command's module in this package, and its help text
     "doctor": ("doctor", "examine a port and its adapter, and advise"),
     "serve": ("serve", "poll a plant for browsers and other programs"),
     "fleet": ("fleet", "share a plant's lines among several gateways, by NATS"),
-    "hub": ("fleet.hub", "store a fleet's samples in Parquet files or in PostgreSQL"),
+    "hub": ("fleet.services", "store a fleet's samples in Parquet files or in PostgreSQL"),
     "monitor": ("monitor", "show the drives of a plant file live on a terminal"),
     "simulate": ("simulate", "simulate the drives of a plant file on pseudo-terminals"),
     "sniff": ("sniff", "listen to a line that another master polls"),

@@ -27,7 +27,7 @@ from typing import Any
 from multidrop.cli.fleet import CA, CREDENTIALS, require_fleet
 from multidrop.cli.fleet.views import drawing, follow
 from multidrop.cli.support.output import print_text
-from multidrop.cli.support.signals import end_signals_cancel
+from multidrop.cli.support.signals import cancel_at_end_signals, run_loop
 from multidrop.cli.support.values import counted
 
 GATEWAYS = ("gw-1", "gw-2", "gw-3")
@@ -111,7 +111,7 @@ def run(arguments: argparse.Namespace) -> int:
         stack.callback(children.close)
         demo = Demo(folder, children, stage)
         demo.start(program)
-        seconds = asyncio.run(demo.play())
+        seconds = run_loop(demo.play())
         children.end(*GATEWAYS, "lines")
     print_text(f"the lines of the killed gateway had other masters after {seconds:.1f} s")
     return 0
@@ -163,10 +163,11 @@ class Demo:
     async def play(self) -> float:
         """Kill a gateway and start it again; return how many seconds its lines took to get other masters.
 
-        Raises KeyboardInterrupt if the process receives a signal.
+        A signal to the process cancels this.
         """
         over = asyncio.Event()
-        with end_signals_cancel(), _drawn(self._stage):
+        cancel_at_end_signals()
+        with _drawn(self._stage):
             watching = asyncio.create_task(self._watch(over))
             try:
                 return await self._story()

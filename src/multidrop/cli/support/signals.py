@@ -146,9 +146,8 @@ def run_loop(work: Coroutine[Any, Any, T]) -> T:
         work.close()  # otherwise Python prints a warning that the coroutine never started
 
 
-@contextmanager
-def end_signals_cancel() -> Iterator[None]:
-    """Cancel the running asyncio task at the first end signal, and then raise KeyboardInterrupt.
+def cancel_at_end_signals() -> None:
+    """Cancel the running asyncio task at the first end signal; `run_loop` then raises KeyboardInterrupt.
 
     If a signal raised an exception directly inside a library's task, other tasks could wait forever.
     """
@@ -156,10 +155,6 @@ def end_signals_cancel() -> Iterator[None]:
 
     if task := asyncio.current_task():
         on_end_signals(task.cancel)
-    try:
-        yield
-    except asyncio.CancelledError:
-        raise KeyboardInterrupt from None
 
 
 def on_reload_signal(reload: Callable[[], object], end: Callable[[], object]) -> None:
