@@ -9,19 +9,14 @@
 
 A row per value would take four and a half times the disk space. Rows are inserted by COPY. A timestamptz has
 a resolution of microseconds; `time_ns` is exact. The drive's monotonic clock is not stored.
-
-The data of a COPY has the format in PostgreSQL's manual, section "COPY, Binary Format". An array is its
-number of dimensions, a flag for nulls, its elements' type, a size, a lower bound, and the elements, each
-after its length.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import cache
-from itertools import pairwise
-from struct import Struct, pack
+from datetime import UTC, datetime, timedelta
+from itertools import chain, pairwise
 from typing import Any, NamedTuple
 
 import psycopg
@@ -31,16 +26,7 @@ from psycopg.conninfo import make_conninfo
 
 from multidrop.samples.message import SinkError
 
-HEAD = b"PGCOPY\n\xff\r\n\0" + bytes(8)
-END = b"\xff\xff"
-EPOCH_US = 946_684_800_000_000  # 2000-01-01, the epoch of PostgreSQL
-FLOAT8, TEXT = 701, 25  # type ids (oids) of float8 and text in PostgreSQL
-NULL = b"\xff\xff\xff\xff"
-PIECE = 1 << 18  # approximate size of one piece of COPY data, in bytes
-# start of a row of COPY data: its number of columns, then time and time_ns, each after its length
-_FIRST = Struct(">hiqiq")
-_NUMBER = Struct(">ii")
-_ARRAY = Struct(">iiiiii")
+EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 ANSWER_S = 10  # time limit for connecting
 # libpq's time limits for a server that does not answer: in s; the last one in ms
 SILENT_SERVER: dict[str, int] = {
@@ -69,6 +55,7 @@ COPY = (
     "copy multidrop.exchanges (time, time_ns, uncertainty_us, drive, registers, values, misses)"
     " from stdin (format binary)"
 )
+TYPES = ("timestamptz", "int8", "int4", "int4", "int4", "float8[]", "text[]")  # types of the columns in COPY
 
 
 class RegisterSet(NamedTuple):
@@ -153,61 +140,6 @@ def _changes(first: Any, second: Any) -> list[int]:
     return [0, *(at + 1 for at in pc.indices_nonzero(either).to_pylist())]
 
 
-def copied(
-    found: Iterable[ExchangeRows], drives: Mapping[str, int], sets: Mapping[RegisterSet, int]
-) -> Iterator[bytes]:
-    """Yield the data of a PostgreSQL COPY in pieces, with the columns of the statement `COPY`."""
-    piece = [HEAD]
-    size = 0
-    for one in found:
-        for exchange in one.exchanges:
-            piece.append(_row(exchange, drives[exchange.drive], sets[exchange.asked]))
-            size += len(piece[-1])
-            if size >= PIECE:
-                yield b"".join(piece)
-                piece, size = [], 0
-    yield b"".join([*piece, END])
-
-
-def _row(exchange: ExchangeRow, drive: int, names: int) -> bytes:
-    time, uncertainty = exchange.time_ns, exchange.uncertainty_ns
-    return b"".join(
-        (
-            _FIRST.pack(7, 8, time // 1000 - EPOCH_US, 8, time),
-            NULL if uncertainty is None else _NUMBER.pack(4, uncertainty // 1000),
-            _NUMBER.pack(4, drive),
-            _NUMBER.pack(4, names),
-            _floats(exchange.values),
-            NULL if exchange.misses is None else _texts(exchange.misses),
-        )
-    )
-
-
-def _floats(values: list[float | None]) -> bytes:
-    if None not in values:
-        many = len(values)
-        numbers: list[Any] = [8] * (2 * many)
-        numbers[1::2] = values
-        return _whole(many).pack(20 + 12 * many, 1, 0, FLOAT8, many, 1, *numbers)
-    elements = [NULL if value is None else pack(">id", 8, value) for value in values]
-    return _array(FLOAT8, elements, has_nulls=True)
-
-
-@cache
-def _whole(many: int) -> Struct:
-    return Struct(">iiiiii" + "id" * many)
-
-
-def _texts(texts: list[str]) -> bytes:
-    encoded = [text.encode() for text in texts]
-    return _array(TEXT, [pack(">i", len(text)) + text for text in encoded], has_nulls=False)
-
-
-def _array(kind: int, elements: list[bytes], *, has_nulls: bool) -> bytes:
-    body = b"".join(elements)
-    return _ARRAY.pack(20 + len(body), 1, int(has_nulls), kind, len(elements), 1) + body
-
-
 class SampleTables:
     """A connection that writes samples into a PostgreSQL database.
 
@@ -258,8 +190,16 @@ class SampleTables:
         found: list[ExchangeRows] = [exchanges_of(table) for table in tables]
         self._insert_names(found)
         with self.connection.cursor() as cursor, cursor.copy(COPY) as copy:
-            for piece in copied(found, self._drives, self._sets):
-                copy.write(piece)
+            copy.set_types(TYPES)
+            for exchange in chain.from_iterable(one.exchanges for one in found):
+                copy.write_row(self._row(exchange))
+
+    def _row(self, exchange: ExchangeRow) -> tuple[Any, ...]:
+        """Return the values of the columns in the statement COPY."""
+        time_ns, uncertainty_ns, drive, asked, values, misses = exchange
+        uncertainty_us = None if uncertainty_ns is None else uncertainty_ns // 1000
+        time = EPOCH + timedelta(microseconds=time_ns // 1000)
+        return time, time_ns, uncertainty_us, self._drives[drive], self._sets[asked], values, misses
 
     def _insert_names(self, found: Sequence[ExchangeRows]) -> None:
         """Insert the drives and register sets that are not in the database yet."""
