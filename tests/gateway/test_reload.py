@@ -19,11 +19,12 @@ from lines import HOST_LATE, PATIENCE, until
 
 import multidrop
 from multidrop import Batch, Bus, InvtCHE, LineError, Plant
-from multidrop.core import boottime_ns
-from multidrop.gateway.gateway import Gateway, Notifier
+from multidrop.core import Names, boottime_ns, now_ns
+from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.http.rights import Right, new_token
 from multidrop.gateway.live import drive_reads
 from multidrop.gateway.settings import ServeSettings, read_settings
+from multidrop.polling.added_rows import AddedRow, JoinedColumns
 from multidrop.recording.segments import segments_of
 from multidrop.sim import Simulator, Wire, simulated
 
@@ -84,8 +85,8 @@ def two_lines(
         )
         gateway, rows = Gateway(*read(), read=read), Rows()
         gateway.feeds["rows"] = rows
-        with running(gateway):
-            yield Served(gateway, sims, secrets), rows
+        with running(gateway) as loop:
+            yield Served(gateway, sims, secrets, loop), rows
 
 
 @pytest.mark.slow
@@ -174,6 +175,22 @@ def test_a_reload_adds_and_removes_drives_and_keeps_unchanged_lines(tmp_path: Pa
         assert {name: one["done"] for name, one in told.items()} == {"pump-1": True, "fan-2": True}
         until(lambda: gateway.gateway.recent.line("roof")["rate"])
         assert gateway.gateway.failures == {}
+
+
+def test_late_rows_of_a_changed_drive_are_dropped_after_a_reload(tmp_path: Path) -> None:
+    """A late row was requested before the reload, so the measuring unit of its value is unknown."""
+    with two_lines(tmp_path) as (gateway, rows):
+        edit(gateway, 'name = "fan-1"', 'name = "fan-2"')
+        asked_ns = now_ns()
+        assert reload(gateway)["done"] is True
+        later_ns = now_ns()
+        added = [AddedRow(0, ns, 0, drive, 0, 0, 3.0) for drive in (0, 1) for ns in (asked_ns, later_ns)]
+        batches = [Batch(JoinedColumns(None, added), Names(["pump-1", "fan-2"]), Names(["status"]))]
+        late = SimpleNamespace(take=lambda: batches.pop() if batches else None)
+        gateway.loop.call_soon_threadsafe(gateway.gateway.hand_out, late)
+        until(lambda: ("fan-2", "ok", later_ns) in rows.found)
+        assert ("pump-1", "ok", asked_ns) in rows.found
+        assert ("fan-2", "ok", asked_ns) not in rows.found
 
 
 @pytest.mark.slow
@@ -520,9 +537,3 @@ def test_a_reload_works_after_a_failed_reload(tmp_path: Path, monkeypatch: pytes
         told = reload(gateway)
         assert (told["done"], told["mistakes"]) == (False, ["integer division or modulo by zero"])
         assert [one["done"] for one in gateway.post("/api/stop").json.values()] == [True, True]
-
-
-def test_a_reload_is_announced_on_systems_without_posix_clocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Windows has neither CLOCK_MONOTONIC nor a service manager's socket."""
-    monkeypatch.setattr("multidrop.gateway.gateway.time", SimpleNamespace())
-    Notifier("").send_reloading()

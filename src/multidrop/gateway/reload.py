@@ -7,9 +7,11 @@ import logging
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
+from math import inf
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from multidrop import Batch, Plant, PlantError, Poller
+from multidrop.core import now_ns
 from multidrop.gateway import utc_ms
 from multidrop.gateway.commands import drives_of
 from multidrop.gateway.live.alarms import Limits
@@ -30,6 +32,8 @@ QUICK_S = 1.0
 MOST_READS = 8  # limit of concurrent reads of the plant file, because each may hang
 # time limit, in s, for putting a plant into effect, which opens ports and stops removed drives
 ADOPTION_S = 60.0
+# after a reload, rows requested under the previous plant may arrive for this long
+SETTLED_NS = 60_000_000_000
 RESTART = "takes effect after a restart"
 NO_FILE = "this plant was not read from a file, so it cannot be reloaded"
 
@@ -64,7 +68,9 @@ class Reload:
         self._by = ""  # who asked for the newest reload
         self._is_overtaken = asyncio.Event()  # set when a later reload was requested
         self.coming: Plant | None = None  # the new plant while a reload is putting it into effect, else None
-        self._changed: frozenset[str] = frozenset()  # drives that the reload in progress changes
+        self._changed: frozenset[str] = frozenset()  # drives that the latest reload changes
+        # rows of these drives that were requested before this time are dropped (CLOCK_MONOTONIC, ns)
+        self._changed_ns: float = 0
 
     @property
     def has_file(self) -> bool:
@@ -138,6 +144,7 @@ class Reload:
         await gateway.parts.replace(settings.parts, plant)
         gateway.hand_out(poller)
         self._changed = frozenset() if is_followed else changed_drives(gateway.plant, plant)
+        self._changed_ns = inf
         self.coming = plant
         try:
             unopened = await supervisor().thread("adoption", ADOPTION_S, partial(poller.adopt, plant))
@@ -153,7 +160,7 @@ class Reload:
             raise
         finally:
             self.coming = None
-            self._changed = frozenset()
+            self._changed_ns = min(self._changed_ns, now_ns())
         gateway.note_unopened(unopened)
         self.mistakes, self.restart = (), tuple(self._after_restart(plant, settings))
         for sentence in self.restart:
@@ -176,19 +183,23 @@ class Reload:
         gateway.guarded("hub", gateway.hub.adopt, plant, planned)
         gateway.guarded("statistics", gateway.recent.adopt, plant, planned)
         gateway.parts.call("adopt", plant)
-        self._changed = frozenset()
+        self._changed_ns = now_ns()
         gateway.guarded("frames", gateway.frames.note_news)
 
     def without_changed_drives(self, batch: Batch) -> Batch:
-        """Return the batch without the drives that the plant file changes, while a reload is in progress.
+        """Return the batch without rows of changed drives that were requested before a reload has ended.
 
         It is unknown whether their values were polled with the old settings or with the new ones.
         """
         columns = batch.columns() if self._changed else None
         if columns is None or self._changed.isdisjoint(columns.drives):
             return batch
-        names = columns.drives
-        return batch.at([at for at, drive in enumerate(columns.drive) if names[drive] not in self._changed])
+        changed = {code for code, name in enumerate(columns.drives) if name in self._changed}
+        rows = enumerate(zip(columns.drive, columns.monotonic_ns, strict=True))
+        kept = [at for at, (drive, ns) in rows if ns >= self._changed_ns or drive not in changed]
+        if min(columns.monotonic_ns, default=0) >= self._changed_ns + SETTLED_NS:
+            self._changed = frozenset()
+        return batch if len(kept) == len(columns.time) else batch.at(kept)
 
     def _after_restart(self, plant: Plant, settings: ServeSettings) -> Iterator[str]:
         """Yield a sentence for each changed key of [serve] that takes effect only after a restart."""

@@ -15,25 +15,19 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from batches import add_rows, new_completion
-from brokers import PUMP
 from forwarded import forwarding, keys_in, rows_at_noon, store, web_server
 from gateways import served, written
 from lines import PATIENCE, until
 from spooled import NOON, numbered
 from tables import table
 
-from multidrop import Plant, PlantError, PlantLine, Polled, PolledDrive
-from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout
-from multidrop.drive.register import reading
-from multidrop.gateway.forward import forwarder
-from multidrop.gateway.forward.forwarder import MOST_ROWS, Forwarding, pieces, row_objects
+from multidrop import PlantError
+from multidrop.gateway.forward.forwarder import MOST_ROWS, pieces, row_objects
 from multidrop.gateway.forward.http import line_protocol
 from multidrop.gateway.http.rights import Right
 from multidrop.gateway.parts import missing_library
 from multidrop.gateway.settings import read_settings
-from multidrop.polling.batch import Batch
-from multidrop.samples import SpoolState, unpack
+from multidrop.samples import SpoolState
 
 
 @table(
@@ -243,48 +237,6 @@ def test_a_hanging_stdout_blocks_no_other_thread(tmp_path: Path, monkeypatch: py
     part._spool.close()
     assert not was_sent
     assert not was_blocked
-
-
-def plant_with(unit: str, folder: Path) -> Plant:
-    """Return a plant whose drive has a register `load` in this unit."""
-    drive = type("Meter", (type(PUMP),), {"load": reading(0x9000, unit, step=0.1)})(1, name="pump-1")
-    polled = PolledDrive(drive, (Polled(drive.load, 1.0),))
-    return Plant((PlantLine("hall", "/dev/null", drives=(polled,)),), folder / "plant.toml")
-
-
-def batch_at(time_ns: int) -> Any:
-    """Return a batch with one row: `load` of pump-1, requested at `time_ns` (monotonic)."""
-    columns = Columns(1)
-    found = new_completion(result=7, sent_ns=time_ns, first_ns=time_ns + 1)
-    found.reply.data_len = 2
-    layout = RowLayout(0, [Field(0, NumberFormat.U16, 0, 1.0, 1.0)])
-    assert add_rows(columns, layout, found, 0)
-    return Batch(columns, Names(["pump-1"]), Names(["load"]))
-
-
-def test_late_rows_from_before_a_reload_are_not_sent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The reload changes the unit of the register, so the unit of a late row is unknown."""
-    sent: list[Any] = []
-    monkeypatch.setattr(forwarder, "now_ns", lambda: 1000)
-    made: Any = Forwarding(  # type: ignore[arg-type]
-        "upload",
-        "it",
-        tmp_path / "spool",
-        "1 GB",
-        plant_with("A", tmp_path),
-        lambda _: sent,  # type: ignore[return-value]
-    )
-    made.take(batch_at(900))
-    made.adopt(plant_with("%", tmp_path))
-    made.take(batch_at(999))  # requested before the new plant was in effect, so its unit is unknown
-    made.take(batch_at(1000))
-    made._spool.close()
-    [stored] = made._spool._folder.messages.values()
-    rows = unpack(stored.path.read_bytes())
-    assert sorted(zip(rows["monotonic_ns"].to_pylist(), rows["unit"].to_pylist(), strict=True)) == [
-        (900, "A"),
-        (1000, "%"),
-    ]
 
 
 # ---- rows as JSON and in line protocol; InfluxDB itself reads them in `test_receivers.py` ----

@@ -24,7 +24,6 @@ from multidrop import Batch, Plant
 from multidrop.core import now_ns
 from multidrop.exposition import MetricFamily
 from multidrop.gateway.metrics import counter
-from multidrop.gateway.reload import changed_drives
 from multidrop.gateway.sending import Refused, RetryingSender
 from multidrop.printable import format_time, printable
 from multidrop.recording import parse_size
@@ -46,8 +45,6 @@ _log = logging.getLogger("multidrop.gateway.forward")
 LOOK_S = 1.0  # interval, in s, of checking that the threads still run
 CLOSING_S = 2.0  # time limit for writing the last rows to the disk
 SENDING_S = 0.5  # time limit for sending the message in progress at shutdown
-# after a reload, rows requested under the previous plant may arrive for this long
-SETTLED_NS = 60_000_000_000
 
 
 def pieces(rows: Any) -> Iterator[Any]:
@@ -306,46 +303,27 @@ class Forwarding:
         make_receiver: Callable[[Path], RowReceiver],
     ) -> None:
         self._name = name
-        self._plant = plant
         self._units = PolledUnits()
-        self._note_units(0)
+        self._note_units(plant, 0)
         self._spool = Spool(folder, "serve", most=parse_size(most), units=self._units, keep_sent=False)
         self._forwarder = RowForwarder(receiver, self._spool, make_receiver(folder))
-        self._changed: frozenset[str] = frozenset()  # drives that the latest reload changed
-        self._adopted_ns = 0
         self._lost_before = 0  # number of lost rows that the health report no longer mentions
         self._sending: asyncio.Future[None] | None = None
         self._is_closed = False
 
-    def _note_units(self, since_ns: int) -> None:
-        for line in self._plant.lines:
+    def _note_units(self, plant: Plant, since_ns: int) -> None:
+        for line in plant.lines:
             self._units.note(line, since_ns)
 
     # ---- the methods of Part ----
 
     def take(self, batch: Batch) -> None:
         """Copy the batch's rows within microseconds; other threads store and send them."""
-        self._spool.append(self._without_former_drives(batch) if self._changed else batch)
+        self._spool.append(batch)
 
     def adopt(self, plant: Plant) -> None:
         """Use another plant: store the measuring units of its registers with all later rows."""
-        self._adopted_ns = now_ns()
-        self._changed = changed_drives(self._plant, plant)
-        self._plant = plant
-        self._note_units(self._adopted_ns)
-
-    def _without_former_drives(self, batch: Batch) -> Batch:
-        """Return the batch without old rows: rows of changed drives that were polled before the reload.
-
-        It is unknown which measuring units the values of old rows have.
-        """
-        columns = batch.columns()
-        former = {code for code, name in enumerate(columns.drives) if name in self._changed}
-        rows = enumerate(zip(columns.drive, columns.monotonic_ns, strict=True))
-        kept = [at for at, (drive, time_ns) in rows if time_ns >= self._adopted_ns or drive not in former]
-        if columns.monotonic_ns and min(columns.monotonic_ns) >= self._adopted_ns + SETTLED_NS:
-            self._changed = frozenset()
-        return batch if len(kept) == len(columns.time) else batch.at(kept)
+        self._note_units(plant, now_ns())
 
     async def run(self) -> None:
         """Forward until cancelled.
