@@ -16,7 +16,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from brokers import FAN, Broker, Listener, Published, Running, has, inside, publish, without_fan
+from brokers import FAN, WITH_NATS, Broker, Listener, Published, Running, has, inside, publish, without_fan
 from free_ports import free_port
 from gateways import certificate, served
 from lines import until
@@ -59,10 +59,13 @@ def now_on_both_clocks() -> tuple[int, int]:
             return utc_ms, boot_ns
 
 
-def test_the_mqtt_broker_retains_the_newest_values(broker: Broker, listener: Listener, start: Start) -> None:
+@WITH_NATS
+def test_the_mqtt_broker_retains_the_newest_values(
+    broker: Broker, listener: Listener, start: Start, fan: Drive
+) -> None:
     start()
     listener.wait_for(has("multidrop/gateway", b"online"))
-    listener.wait_for(has(f"multidrop/{FAN.name}/available", b"online"))
+    listener.wait_for(has(f"multidrop/{fan.name}/available", b"online"))
     with closing(Listener(broker)) as later:
         said = later.wait_for(has("multidrop/pump-1"))
     assert said.is_retained
@@ -87,6 +90,7 @@ def test_mqtt_shows_stale_values_as_null_and_silent_drives_as_offline(
     assert json_of(said)["values"]["output_frequency"] is None
 
 
+@WITH_NATS
 def test_the_broker_retains_the_message_offline_after_a_lost_connection(
     broker: Broker, listener: Listener, start: Start
 ) -> None:
@@ -216,6 +220,7 @@ def write_of(value: object, time_ms: int, **more: object) -> bytes:
     return json.dumps({"value": value, "time": time_ms, **more}).encode()
 
 
+@WITH_NATS
 def test_a_repeated_mqtt_write_is_carried_out_once(
     broker: Broker, listener: Listener, commanded: Any
 ) -> None:
@@ -228,6 +233,7 @@ def test_a_repeated_mqtt_write_is_carried_out_once(
 
 
 @pytest.mark.parametrize("age_ms", [60_000, -60_000])
+@WITH_NATS
 def test_an_mqtt_command_is_refused_if_its_time_is_wrong_by_a_minute(
     broker: Broker, listener: Listener, commanded: Any, age_ms: int
 ) -> None:
@@ -241,6 +247,7 @@ def test_an_mqtt_command_is_refused_if_its_time_is_wrong_by_a_minute(
 
 
 @pytest.mark.parametrize("topic", ["multidrop/pump-1/set/setpoint", "multidrop/pump-1/act"])
+@WITH_NATS
 def test_a_retained_command_is_refused(broker: Broker, listener: Listener, start: Start, topic: str) -> None:
     sent = {"value": 25, "verb": "start", "drive": "pump-1", "time": now_ms() + 1000}
     publish(broker, topic, json.dumps(sent).encode(), "-r")
@@ -250,15 +257,18 @@ def test_a_retained_command_is_refused(broker: Broker, listener: Listener, start
 
 
 @pytest.mark.slow
-def test_a_stop_is_carried_out_on_each_stop_topic(broker: Broker, listener: Listener, start: Start) -> None:
+@WITH_NATS
+def test_a_stop_is_carried_out_on_each_stop_topic(
+    broker: Broker, listener: Listener, start: Start, fan: Drive
+) -> None:
     publish(broker, "multidrop/pump-1/stop", b"stop", "-r")
     known, _ = start(commands=True)
     assert told(listener)["what"] == "stop"
     publish(broker, "multidrop/stop", b"whatever")
     assert told(listener)["what"] == "stop"
-    publish(broker, f"multidrop/{FAN.name}/stop", b"stop", "-q", "1")
-    assert told(listener, FAN.name)["what"] == "stop"
-    assert known.commands.noted[-3:] == [("stop", ["pump-1"]), ("stop", None), ("stop", [FAN.name])]
+    publish(broker, f"multidrop/{fan.name}/stop", b"stop", "-q", "1")
+    assert told(listener, fan.name)["what"] == "stop"
+    assert known.commands.noted[-3:] == [("stop", ["pump-1"]), ("stop", None), ("stop", [fan.name])]
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,18 @@ from unittest.mock import patch
 
 import pytest
 from batches import add_rows, new_completion
-from brokers import FAN, ROOT, Broker, Host, Running, command, inside, sparkplug_messages, without_fan
+from brokers import (
+    FAN,
+    ROOT,
+    WITH_NATS,
+    Broker,
+    Host,
+    Running,
+    command,
+    inside,
+    sparkplug_messages,
+    without_fan,
+)
 from hypothesis import given
 from hypothesis import strategies as st
 from lines import until
@@ -37,17 +48,18 @@ from multidrop.polling.batch import Batch
 
 
 @pytest.fixture
-def node(broker: Broker, host: Host, tmp_path: Path) -> Iterator[tuple[Any, Running]]:
+def node(broker: Broker, host: Host, fan: Drive, tmp_path: Path) -> Iterator[tuple[Any, Running]]:
     require_module("paho.mqtt.client")
-    known = inside(tmp_path)
+    known = inside(tmp_path, fan)
     settings = MqttSettings(broker.address, sparkplug="works", node="line", commands=True)
     running = Running(build(settings, known))
     yield known, running
     running.close()
 
 
+@WITH_NATS
 def test_a_sparkplug_node_publishes_births_deaths_and_changed_values(
-    host: Host, node: tuple[Any, Running]
+    host: Host, node: tuple[Any, Running], fan: Drive
 ) -> None:
     known, running = node
     birth = host.values(host.wait_for("NBIRTH"))
@@ -60,17 +72,17 @@ def test_a_sparkplug_node_publishes_births_deaths_and_changed_values(
         "setpoint": None,
         "Device Control/Stop": False,
     }
-    host.wait_for("DBIRTH", FAN.name)
+    host.wait_for("DBIRTH", fan.name)
     known.hub.values[("pump-1", "output_frequency")] = 50.0
     running.step()
     assert host.values(host.wait_for("DDATA", "pump-1")) == {"output_frequency": 50.0}
-    known.hub.states[FAN.name] = "silent"
+    known.hub.states[fan.name] = "silent"
     running.step()
-    host.wait_for("DDEATH", FAN.name)
-    known.hub.states[FAN.name] = "fault"
-    known.hub.faults[FAN.name] = "перегрев"
+    host.wait_for("DDEATH", fan.name)
+    known.hub.states[fan.name] = "fault"
+    known.hub.faults[fan.name] = "перегрев"
     running.step()
-    born = host.values(host.wait_for("DBIRTH", FAN.name))
+    born = host.values(host.wait_for("DBIRTH", fan.name))
     assert (born["state"], born["fault"]) == ("fault", "перегрев")
 
 
@@ -141,19 +153,23 @@ def test_sequence_numbers_of_messages_restart_at_0_after_255(host: Host, node: t
     assert host.seq < 256
 
 
+@WITH_NATS
 def test_a_rebirth_command_repeats_all_birth_certificates(
-    broker: Broker, host: Host, node: tuple[Any, Running]
+    broker: Broker, host: Host, node: tuple[Any, Running], fan: Drive
 ) -> None:
-    host.wait_for("DBIRTH", FAN.name)
+    host.wait_for("DBIRTH", fan.name)
     command(broker, ROOT.format("NCMD"), name="Node Control/Rebirth", boolean_value=True, datatype=11)
     assert host.values(host.wait_for("NBIRTH"))["bdSeq"] == 0
     host.wait_for("DBIRTH", "pump-1")
-    host.wait_for("DBIRTH", FAN.name)
+    host.wait_for("DBIRTH", fan.name)
 
 
 @pytest.mark.slow
-def test_each_sparkplug_connection_has_the_next_bdseq_number(host: Host, node: tuple[Any, Running]) -> None:
-    host.wait_for("DBIRTH", FAN.name)
+@WITH_NATS
+def test_each_sparkplug_connection_has_the_next_bdseq_number(
+    host: Host, node: tuple[Any, Running], fan: Drive
+) -> None:
+    host.wait_for("DBIRTH", fan.name)
     node[1].cut(1)
     assert host.values(host.wait_for("NDEATH")) == {"bdSeq": 0}
     assert host.values(host.wait_for("NBIRTH"))["bdSeq"] == 1
@@ -201,13 +217,14 @@ def test_closing_the_gateway_sends_a_death_certificate(broker: Broker, host: Hos
     assert host.values(host.wait_for("NDEATH")) == {"bdSeq": 0}
 
 
+@WITH_NATS
 def test_an_old_sparkplug_write_is_not_sent_but_an_old_stop_is(
-    broker: Broker, host: Host, node: tuple[Any, Running]
+    broker: Broker, host: Host, node: tuple[Any, Running], fan: Drive
 ) -> None:
     known, _ = node
     host.wait_for("DBIRTH", "pump-1")
     alias = {name: number for number, name in host.aliases.items()}["setpoint"]
-    host.wait_for("DBIRTH", FAN.name)
+    host.wait_for("DBIRTH", fan.name)
     topic = ROOT.format("DCMD") + "/pump-1"
     old_ms = time.time_ns() // 1_000_000 - 60_000
     command(broker, topic, name="setpoint", double_value=10.0, datatype=10, time_ms=old_ms)

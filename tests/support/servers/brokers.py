@@ -11,7 +11,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import AbstractContextManager, closing, contextmanager, suppress
 from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
@@ -103,6 +103,22 @@ def nats(folder: Path, program: str) -> Iterator[Broker]:
         return [program, "-c", str(folder / "nats.conf")]
 
     yield from _running(Broker(command))
+
+
+def new_nats(folder: Path) -> AbstractContextManager[Broker]:
+    """Run nats-server in the version that a fleet needs."""
+    from nats_clusters import server_program
+
+    return nats(folder, server_program())
+
+
+# Runs a test with both brokers; with nats-server, the test is slow.
+WITH_NATS = pytest.mark.parametrize(
+    "broker",
+    [mosquitto, pytest.param(new_nats, marks=pytest.mark.slow)],
+    indirect=True,
+    ids=["mosquitto", "nats"],
+)
 
 
 def _running(broker: Broker) -> Iterator[Broker]:
