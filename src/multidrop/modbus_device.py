@@ -40,7 +40,8 @@ class ModbusDevice(Drive):
     Addresses are those on the wire, from 0. Numbers have the formats of family files ("U16" to "F64") and the
     byte orders "ABCD", "CDAB", "BADC" and "DCBA". As for other drives, the library waits for the silence
     between frames, retries reads, detects late replies, and records writes in the audit log. A write needs
-    `confirm=True`, because it may start a motor.
+    `confirm=True`, because it may start a motor. If a device often does not answer, it may need a longer
+    silence between frames than Modbus asks for: `ModbusDevice(7, silence=0.01)`, in s.
     """
 
     title = "Modbus device"

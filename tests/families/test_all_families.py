@@ -381,7 +381,9 @@ def test_a_verb_missing_from_a_family_raises_unsupported() -> None:
 
         speed = reading(0, "rpm")
 
-    with pytest.raises(ValueError, match=r"^Mute has no option 'rated_frequency'; its options: none$"):
+    with pytest.raises(
+        ValueError, match=r"^Mute has no argument or option 'rated_frequency'; it takes name, framing, "
+    ):
         Mute(1, rated_frequency=50)
     for name in VERBS:
         given = (5.0,) if name == "set_frequency" else ()

@@ -19,7 +19,7 @@ from multidrop.families.files.sections import NOT_OPTIONS
 from multidrop.families.yd1000 import YD1000
 from multidrop.plant import RESERVED_NAMES, check_drive_name, drive_meant
 from multidrop.plant.loader import DRIVE_KEYS, PlantError, load_plant
-from multidrop.plant.model import Plant, Polled
+from multidrop.plant.model import Plant, Polled, PolledDrive
 from multidrop.toml_check import parse_duration
 
 FAMILY = """\
@@ -365,11 +365,11 @@ def test_all_mistakes_in_a_plant_file_are_reported_together(mistakes: Mistakes) 
         ),
         (
             HEAD + TOY + 'poll = ["output_current", { register = "output_current" }]',
-            'line "L", drive "D", poll number 2: output_current is in poll twice; remove one',
+            'line "L", drive "D": output_current of D is in poll twice; remove one',
         ),
         (
             HEAD + TOY + 'poll = ["*", "*"]',
-            'line "L", drive "D", poll number 2: "*" is in poll twice; remove one',
+            'line "L", drive "D": * of D is in poll twice; remove one',
         ),
         (
             HEAD + TOY + 'poll = [{ register = "output_current", evry = "1 s" }]',
@@ -680,6 +680,12 @@ def test_a_star_in_the_poll_list_means_all_readings(load: Load) -> None:
         "output_frequency": 2.0,
         "output_current": 1.0,
     }
+
+
+@table("twice", [["status", "status"], ["*", "*"], [YD1000.register("status"), Polled("status", 1.0)]])
+def test_a_drive_in_python_refuses_a_register_that_is_polled_twice(twice: list[Any]) -> None:
+    with pytest.raises(ValueError, match=r"^(status|\*) of yd1000@1 is in poll twice; remove one$"):
+        PolledDrive(YD1000(1), twice)
 
 
 def test_a_text_register_in_a_poll_list_is_a_mistake(mistakes: Mistakes, tmp_path: Path) -> None:

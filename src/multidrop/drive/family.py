@@ -278,8 +278,8 @@ class Drive(RegisterAccess):
         """Raise ValueError for an unknown option or a value outside the option's limits."""
         for name, value in given.items():
             if name not in cls.options:
-                known = ", ".join(cls.options) or "none"
-                raise ValueError(f"{cls._kind()} has no option {name!r}; its options: {known}")
+                known = ", ".join([*(Drive.__init__.__kwdefaults__ or ()), *cls.options])
+                raise ValueError(f"{cls._kind()} has no argument or option {name!r}; it takes {known}")
             (low, high), unit = cls.options[name].span, cls.options[name].unit
             if not is_number(value) or not low <= value <= high:
                 raise ValueError(f"{name} = {value!r} is outside {low:g} to {high:g} {unit}".rstrip())

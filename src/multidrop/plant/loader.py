@@ -289,7 +289,10 @@ def _drive(table: Any, line: Mapping[str, Any], place: TomlPlace) -> PolledDrive
     drive = place.attempt(partial(model, name=given["name"], **inherited, **arguments))
     if drive and place.attempt(partial(_on_port, drive, line["port"])) is None:
         return None
-    return PolledDrive(drive, polls, channels=filter(None, channels)) if drive else None
+    if drive is None:
+        return None
+    polled = partial(PolledDrive, drive, channels=tuple(filter(None, channels)))
+    return place.attempt(polled, polls, key="poll") or polled([])
 
 
 def _channel(table: Any, place: TomlPlace) -> Channel | None:
@@ -385,14 +388,12 @@ def _polled(entry: Any, model: type[Drive], every: float | None, place: TomlPlac
     given = place.check({"register": entry} if isinstance(entry, str) else entry, POLL_KEYS)
     own = duration_of(given, "every", place) if "every" in given else every
     if given.get("register") == "*":
-        place.once(place.steps[:-1], "*", sentence='"*" is in poll twice; remove one')
         return Polled("*", own)
     register = (
         place.attempt(model.register, given["register"], key="register") if "register" in given else None
     )
     if register is None:
         return None
-    place.once(place.steps[:-1], register.name, sentence=f"{register} is in poll twice; remove one")
     if not register.readable:
         place.wrong(f"{register} can only be written, not polled; see `multidrop models {model.model}`")
         return None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
 from enum import Flag
@@ -141,13 +142,16 @@ class PolledDrive:
 
 
 def _polls(drive: Drive, given: Iterable[Polled]) -> Iterator[Polled]:
-    """Yield the polled registers of the entries `given`: see PolledDrive."""
+    """Yield the polled registers of the entries `given`: see PolledDrive. Raises ValueError for repeats."""
 
     def known(name: Register[Any] | str) -> Register[Any] | str:
         return drive.register(name) if isinstance(name, str) and name != "*" else name
 
     entries = [(known(poll.register), poll.every) for poll in given]
-    named = {register for register, _ in entries}
+    named = Counter(register for register, _ in entries)
+    for register, count in named.items():
+        if count > 1:
+            raise ValueError(f"{register} of {drive.name} is in poll twice; remove one")
     for register, every in entries:
         if isinstance(register, str):  # "*"
             yield from (Polled(one, every) for one in drive.readings() if one not in named)

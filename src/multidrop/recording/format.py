@@ -126,6 +126,12 @@ class RecordingReader(ArrowTable):
     def __iter__(self) -> Iterator[Rows]:
         """Yield batches of some thousand rows. Raises ValueError if the file is damaged."""
 
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        """Leave the reader as it is: each iteration opens the file, and closes it at its end."""
+
     def __repr__(self) -> str:
         try:
             size = self.path.stat().st_size
