@@ -24,7 +24,6 @@ from multidrop.gateway import gateway as gateway_module
 from multidrop.gateway import historian, parts, reload, settings
 from multidrop.gateway.http import files
 from multidrop.gateway.http import routes as web
-from multidrop.gateway.http.rights import Right
 from multidrop.gateway.live import views
 from multidrop.history import writer as writer_module
 
@@ -89,12 +88,6 @@ def assert_stops_and_polls(gateway: Served) -> None:
     until(lambda: health(gateway)["newest_row"] > newest)
 
 
-def reload_as(gateway: Served, serve: str) -> Any:
-    path = gateway.gateway.plant.path
-    path.write_text(path.read_text().partition("[serve")[0] + serve)
-    return gateway.post("/api/reload", {"confirm": True}, **gateway.writer).json
-
-
 def test_the_history_starts_when_a_hanging_disk_answers(tmp_path: Path, fifos: Fifos) -> None:
     fifos.put(tmp_path / "kept" / "rows.00000001.arrows")
     with served(tmp_path, SERVE + HISTORY) as gateway:
@@ -111,10 +104,10 @@ def test_the_history_starts_when_a_hanging_disk_answers(tmp_path: Path, fifos: F
 def test_reload_continues_while_the_history_disk_hangs(tmp_path: Path, fifos: Fifos) -> None:
     fifos.put(tmp_path / "kept" / "rows.00000001.arrows")
     with served(tmp_path, SERVE) as gateway:
-        assert reload_as(gateway, SERVE + HISTORY)["done"] is True
+        assert gateway.reload(SERVE + HISTORY)["done"] is True
         assert_stops_and_polls(gateway)
         assert health(gateway)["parts"] == {"history": COMING}
-        assert reload_as(gateway, SERVE)["done"] is True
+        assert gateway.reload(SERVE)["done"] is True
         assert health(gateway)["parts"] == {}
         fifos.let_go()
         until(lambda: health(gateway)["status"] == "ok")
@@ -188,10 +181,9 @@ def test_only_the_reload_fails_if_reading_the_plant_file_hangs(
     with served(tmp_path, SERVE) as gateway:
         path, good = gateway.gateway.plant.path, gateway.gateway.plant.path.read_text()
         fifos.put(path)
-        headers = {"authorization": gateway.bearer(Right.WRITE)}
         with monkeypatch.context() as patch:
             patch.setattr(reload, "READ_S", SHORT_S)
-            told = gateway.post("/api/reload", {"confirm": True}, **headers).json
+            told = gateway.reload()
         assert (told["done"], told["mistakes"]) == (
             False,
             ["reload: not done within 0.1 s; does the disk answer?"],
@@ -200,7 +192,7 @@ def test_only_the_reload_fails_if_reading_the_plant_file_hangs(
         assert_stops_and_polls(gateway)
         fifos.let_go()
         path.write_text(good)
-        assert gateway.post("/api/reload", {"confirm": True}, **headers).json["done"] is True
+        assert gateway.reload()["done"] is True
         until(lambda: health(gateway)["status"] == "ok")
 
 
@@ -244,7 +236,7 @@ def test_a_reload_fails_without_changes_if_the_audit_log_hangs(
         fifos.put(tmp_path / "audit.jsonl")
         for module in (settings, reload):
             monkeypatch.setattr(module, "AUDIT_S", SHORT_S)
-        told = reload_as(gateway, SERVE)
+        told = gateway.reload(SERVE)
         assert told["mistakes"] == ["audit log: not done within 0.1 s; does the disk answer?"]
         assert_stops_and_polls(gateway)
 

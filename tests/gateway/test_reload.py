@@ -7,35 +7,36 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from broken_part import BrokenFeed
-from gateways import POLL, Answer, Served, certificate, plant_text, running, served, simulated_plant, tokens
+from gateways import (
+    POLL,
+    Answer,
+    Served,
+    certificate,
+    gateway_of,
+    plant_text,
+    running,
+    served,
+    simulated_plant,
+    tokens,
+)
 from lines import HOST_LATE, PATIENCE, until
 
 import multidrop
 from multidrop import Batch, Bus, InvtCHE, LineError, Plant
 from multidrop.core import Names, boottime_ns, now_ns
-from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.http.rights import Right, new_token
 from multidrop.gateway.live import drive_reads
-from multidrop.gateway.settings import ServeSettings, read_settings
 from multidrop.polling.added_rows import AddedRow, JoinedColumns
 from multidrop.recording.segments import segments_of
 from multidrop.sim import Simulator, Wire, simulated
 
 MAY = '[serve.may]\nstop = "anyone"\nwrite = ["pump-1.setpoint"]\nverbs = ["pump-1.start"]\n'
-
-
-def reload(gateway: Served) -> Any:
-    answer = gateway.post("/api/reload", {"confirm": True}, **gateway.writer)
-    assert answer.status == 200
-    until(lambda: gateway.frame()["revision"] == gateway.gateway.revision)
-    return answer.json
 
 
 def edit(gateway: Served, old: str, new: str) -> None:
@@ -72,18 +73,13 @@ def two_lines(
     secrets, known = tokens()
     sims = {name: simulated(InvtCHE(1, name=name, baudrate=38400)) for name in ("pump-1", "fan-1")}
     path = folder / "plant.toml"
-
-    def read() -> tuple[Plant, ServeSettings]:
-        plant = Plant.load(path)
-        return plant, replace(read_settings(plant, {}), port=0, tokens=known)
-
     with Simulator([Wire([sim], unpaced=True) for sim in sims.values()]) as simulator:
         hall, roof = (wire.path for wire in simulator.wires)
         path.write_text(
             plant_text(hall, ["pump-1"])
             + plant_text(roof, fans, serve).replace('name = "hall"', 'name = "roof"')
         )
-        gateway, rows = Gateway(*read(), read=read), Rows()
+        gateway, rows = gateway_of(path, tokens=known), Rows()
         gateway.feeds["rows"] = rows
         with running(gateway) as loop:
             yield Served(gateway, sims, secrets, loop), rows
@@ -100,16 +96,16 @@ def test_a_reload_changes_nothing_if_the_plant_file_has_mistakes(tmp_path: Path)
         path.write_text(
             good.replace('model = "invt-che"', 'model = "invt-chf"').replace("= 38400", '= "fast"')
         )
-        told = reload(gateway)
+        told = gateway.reload()
         assert told["done"] is False
         assert told["text"] == "the previous plant stays in use: the file has mistakes"
         lines = told["mistakes"]
         assert [mistake.partition(": ")[0] for mistake in lines] == [f"{path}:{line}" for line in (4, 7, 13)]
         path.write_text(path.read_text() + '[serve]\nlisten = 80\n[serve.may]\nwrite = ["pump-9.setpoint"]\n')
-        (of_serve,) = [one for one in reload(gateway)["mistakes"] if one not in lines]
+        (of_serve,) = [one for one in gateway.reload()["mistakes"] if one not in lines]
         assert of_serve == f'{path}:18: [serve]: listen = 80 is not right; write listen = "127.0.0.1:8750"'
         path.write_text(good + '[serve]\nlisten = 80\n[serve.may]\nwrite = ["pump-9.setpoint"]\n')
-        mistakes = reload(gateway)["mistakes"]
+        mistakes = gateway.reload()["mistakes"]
         assert mistakes == [
             f'{path}:18: [serve]: listen = 80 is not right; write listen = "127.0.0.1:8750"',
             f"{path}:20: [serve.may]: write: there is no drive 'pump-9'; did you mean pump-2 or pump-1?",
@@ -124,10 +120,10 @@ def test_a_reload_changes_nothing_if_the_plant_file_has_mistakes(tmp_path: Path)
         until(lambda: (gateway.gateway.hub.last_answer("pump-2") or (0,)) > taken)
 
         path.unlink()
-        (mistake,) = reload(gateway)["mistakes"]
+        (mistake,) = gateway.reload()["mistakes"]
         assert "plant.toml" in mistake
         path.write_text(good)
-        assert reload(gateway) == {
+        assert gateway.reload() == {
             "done": True,
             "text": "plant.toml is in effect",
             "mistakes": [],
@@ -149,7 +145,7 @@ def test_a_reload_adds_and_removes_drives_and_keeps_unchanged_lines(tmp_path: Pa
         gateway.await_state("fan-1", "silent")
         until(lambda: [one for one in gateway.frame()["alarms"] if one["drive"] == "fan-1"])
         edit(gateway, 'name = "fan-1"', 'name = "fan-2"')
-        assert reload(gateway)["done"] is True
+        assert gateway.reload()["done"] is True
         gateway.sims["fan-1"].deaf_until = 0.0
         gateway.await_state("fan-2", "stands")
         frame = gateway.frame()
@@ -182,7 +178,7 @@ def test_late_rows_of_a_changed_drive_are_dropped_after_a_reload(tmp_path: Path)
     with two_lines(tmp_path) as (gateway, rows):
         edit(gateway, 'name = "fan-1"', 'name = "fan-2"')
         asked_ns = now_ns()
-        assert reload(gateway)["done"] is True
+        assert gateway.reload()["done"] is True
         later_ns = now_ns()
         added = [AddedRow(0, ns, 0, drive, 0, 0, 3.0) for drive in (0, 1) for ns in (asked_ns, later_ns)]
         batches = [Batch(JoinedColumns(None, added), Names(["pump-1", "fan-2"]), Names(["status"]))]
@@ -198,12 +194,12 @@ def test_a_missing_port_is_reported_after_a_reload(tmp_path: Path) -> None:
     with two_lines(tmp_path) as (gateway, _):
         roof = gateway.gateway.plant.lines[1].port
         edit(gateway, roof, str(tmp_path / "nosuch"))
-        assert reload(gateway)["done"] is True
+        assert gateway.reload()["done"] is True
         assert gateway.frame()["lines"]["roof"]["lost"] == f"{tmp_path}/nosuch: there is no such port"
-        assert reload(gateway)["done"] is True  # the reason is still reported after another reload
+        assert gateway.reload()["done"] is True  # the reason is still reported after another reload
         assert gateway.frame()["lines"]["roof"]["lost"] == f"{tmp_path}/nosuch: there is no such port"
         edit(gateway, str(tmp_path / "nosuch"), roof)
-        assert reload(gateway)["done"] is True
+        assert gateway.reload()["done"] is True
         gateway.await_state("fan-1", "stands")
         until(lambda: gateway.frame()["lines"]["roof"]["lost"] is None)
 
@@ -217,7 +213,7 @@ def test_a_reload_applies_changed_rights_and_host_names(tmp_path: Path) -> None:
         edit(gateway, "localhost:1", "localhost:2")
         edit(gateway, 'stop = "anyone"\nwrite = ["pump-1.setpoint"]', 'write = ["pump-2.setpoint"]')
         restart = ["listen of [serve] takes effect after a restart"]
-        assert reload(gateway)["restart"] == restart
+        assert gateway.reload()["restart"] == restart
         assert gateway.get("/health").json["restart"] == restart
         assert gateway.get("/health", host="old.example").status == 421
         assert gateway.get("/health", host="new.example").status == 200
@@ -235,7 +231,7 @@ def test_a_reload_applies_changed_rights_and_host_names(tmp_path: Path) -> None:
 def test_a_reload_grants_no_rights_while_a_proxy_setting_needs_a_restart(tmp_path: Path) -> None:
     with served(tmp_path, "[serve]\nbehind_proxy = false\n") as gateway:
         edit(gateway, "behind_proxy = false\n", f"behind_proxy = true\n{MAY}")
-        assert reload(gateway)["restart"] == ["behind_proxy of [serve] takes effect after a restart"]
+        assert gateway.reload()["restart"] == ["behind_proxy of [serve] takes effect after a restart"]
         assert gateway.post("/api/stop").status == 401
 
 
@@ -244,9 +240,9 @@ def test_a_reload_reports_that_a_renewed_certificate_needs_a_restart(tmp_path: P
     certificate(tmp_path, "own")
     serve = '[serve]\ncertificate = "own.pem"\nkey = "own.key"\n'
     with served(tmp_path, serve, tls=None) as gateway:
-        assert reload(gateway)["restart"] == []
+        assert gateway.reload()["restart"] == []
         certificate(tmp_path, "own")
-        assert reload(gateway)["restart"] == ["certificate of [serve] takes effect after a restart"]
+        assert gateway.reload()["restart"] == ["certificate of [serve] takes effect after a restart"]
         assert gateway.get("/health").json["restart"] == [
             "certificate of [serve] takes effect after a restart"
         ]
@@ -259,12 +255,7 @@ def test_a_token_removed_from_the_file_is_invalid_after_a_reload(tmp_path: Path)
     file.write_text("".join(f"{token.line}\n" for token in known))
     serve = '[serve]\ntokens = "tokens"\n[serve.may]\nlook = "token"\n'
     with simulated_plant(tmp_path, serve) as path:
-
-        def read() -> tuple[Plant, ServeSettings]:
-            plant = Plant.load(path)
-            return plant, replace(read_settings(plant, {}), port=0)
-
-        gateway = Gateway(*read(), read=read)
+        gateway = gateway_of(path)
         with running(gateway):
             client = Served(gateway, {}, secrets)
 
@@ -277,7 +268,7 @@ def test_a_token_removed_from_the_file_is_invalid_after_a_reload(tmp_path: Path)
             assert answers() == [200, 200, 200, 401]  # until the reload, the removed token is valid
             assert gateway.commands.plant_ns is None
             begun_ns = boottime_ns()
-            assert client.post("/api/reload", {"confirm": True}, **client.writer).json["done"] is True
+            assert client.reload()["done"] is True
             assert answers() == [401, 401, 200, 200]
             read_ns = gateway.commands.plant_ns  # time of the latest reload
             assert read_ns is not None
@@ -302,7 +293,7 @@ def test_values_polled_before_a_reload_are_not_shown_after_it(
         gateway.await_state("pump-1", "silent")
         assert values()
         edit(gateway, MAY, "")
-        assert reload(gateway)["done"] is True
+        assert gateway.reload()["done"] is True
         assert values() == []
 
 
@@ -312,12 +303,11 @@ def test_a_reload_grants_no_rights_while_a_changed_address_needs_a_restart(tmp_p
     with served(tmp_path, serve) as gateway:
         edit(gateway, "127.0.0.1:0", "127.0.0.2:0")
         edit(gateway, 'look = "token"', 'stop = "anyone"')
-        told = gateway.post("/api/reload", {"confirm": True}, **gateway.writer).json
-        assert told["restart"] == ["listen of [serve] takes effect after a restart"]
+        assert gateway.reload()["restart"] == ["listen of [serve] takes effect after a restart"]
         assert gateway.get("/api/plant").status == 401
         assert gateway.post("/api/stop").status == 401
         edit(gateway, "127.0.0.2:0", "127.0.0.1:0")
-        assert gateway.post("/api/reload", {"confirm": True}, **gateway.writer).json["restart"] == []
+        assert gateway.reload()["restart"] == []
         assert gateway.get("/api/plant").json["may"]["role"] == "stop"
 
 
@@ -344,7 +334,7 @@ def test_a_start_sent_before_a_reload_does_not_reach_a_new_drive_of_that_name(tm
         path.write_text(
             re.sub(r'name = "(pump-.)"', lambda found: f'name = "{names[found[1]]}"', path.read_text())
         )
-        assert reload(gateway)["done"] is True
+        assert gateway.reload()["done"] is True
         start = {"drive": "pump-1", "verb": "start", "options": {}, "seen": seen}
         told = gateway.post("/api/act", start, **gateway.writer).json
         assert told["text"].startswith(
@@ -372,7 +362,7 @@ def test_a_stop_during_a_reload_stops_the_new_drive(tmp_path: Path, monkeypatch:
         old = gateway.gateway.plant.lines[1].drives[0].drive
         edit(gateway, 'name = "fan-1"', 'name = "fan-1"\nmaximum_frequency = 50.0')
         told: list[Any] = []
-        threads = [threading.Thread(target=lambda: told.append(reload(gateway)))]
+        threads = [threading.Thread(target=lambda: told.append(gateway.reload()))]
         threads[0].start()
         assert changed.wait(PATIENCE)
         assert old.bus is None
@@ -422,7 +412,7 @@ def test_a_stop_is_sent_while_a_reload_opens_another_port(
         # the changed key makes the reload open this line again
         edit(gateway, 'name = "hall"', 'name = "hall"\necho = "off"')
         told: list[Any] = []
-        reloading = threading.Thread(target=lambda: told.append(reload(gateway)))
+        reloading = threading.Thread(target=lambda: told.append(gateway.reload()))
         reloading.start()
         try:
             assert opening.wait(PATIENCE)
@@ -464,7 +454,7 @@ def test_old_values_never_get_the_unit_of_measurement_of_a_new_drive(
         path, poller, hub = gateway.gateway.plant.path, gateway.gateway.poller, gateway.gateway.hub
         assert poller is not None
         path.write_text(path.read_text().replace(POLL, '["dc_bus_voltage"]'))
-        assert reload(gateway)["done"]
+        assert gateway.reload()["done"]
         until(lambda: hub.fresh("fan-1", "dc_bus_voltage") is not None)
         opening, go_on = held_up(monkeypatch)
         # the changed key makes the reload open this line again
@@ -472,7 +462,7 @@ def test_old_values_never_get_the_unit_of_measurement_of_a_new_drive(
         before, _, roof = text.rpartition('model = "invt-che"')
         path.write_text(f'{before}model = "other.toml"\nformat = "8N1"{roof}')
         told: list[Any] = []
-        reloading = threading.Thread(target=lambda: told.append(reload(gateway)))
+        reloading = threading.Thread(target=lambda: told.append(gateway.reload()))
         reloading.start()
         try:
             assert opening.wait(PATIENCE), told
@@ -513,7 +503,7 @@ def test_a_stop_in_progress_continues_during_a_reload(tmp_path: Path) -> None:
         stopping.start()
         until(lambda: gateway.gateway.commands.called > called)
         edit(gateway, 'name = "fan-1"', 'name = "fan-1"\nmaximum_frequency = 50.0')
-        reloading = threading.Thread(target=lambda: told.append(reload(gateway)))
+        reloading = threading.Thread(target=lambda: told.append(gateway.reload()))
         reloading.start()
         gateway.await_state("pump-1", "stands")
         gateway.sims["fan-1"].deaf_until = 0.0
@@ -531,9 +521,9 @@ def test_a_reload_works_after_a_failed_reload(tmp_path: Path, monkeypatch: pytes
 
     with two_lines(tmp_path) as (gateway, _):
         gateway.gateway.feeds["deaf"] = Deaf()
-        assert reload(gateway)["done"] is True
+        assert gateway.reload()["done"] is True
         assert gateway.gateway.failures["deaf"] > 0
         monkeypatch.setattr(gateway.gateway.poller, "adopt", lambda plant: 1 // 0)
-        told = reload(gateway)
+        told = gateway.reload()
         assert (told["done"], told["mistakes"]) == (False, ["integer division or modulo by zero"])
         assert [one["done"] for one in gateway.post("/api/stop").json.values()] == [True, True]

@@ -35,15 +35,6 @@ def gateway(tmp_path: Path) -> Iterator[Served]:
         yield gateway
 
 
-def reload(gateway: Served, serve: str) -> Any:
-    """Reload the plant file with these [serve] tables, and return the gateway's answer."""
-    path = gateway.gateway.plant.path
-    path.write_text(path.read_text().partition("[serve")[0] + serve)
-    answer = gateway.post("/api/reload", {"confirm": True}, **gateway.writer)
-    assert answer.status == 200
-    return answer.json
-
-
 def parts(gateway: Served) -> dict[str, str]:
     found: dict[str, str] = gateway.get("/health").json["parts"]
     return found
@@ -64,28 +55,28 @@ IN_EFFECT = {"done": True, "text": "plant.toml is in effect", "mistakes": [], "r
 
 def test_a_reload_can_start_change_or_end_the_modbus_server(gateway: Served) -> None:
     first, second = free_port(), free_port()
-    assert reload(gateway, MODBUS.format(first, 21)) == IN_EFFECT
+    assert gateway.reload(MODBUS.format(first, 21)) == IN_EFFECT
     until(lambda: status_of(first, 21) == [3])
     server = gateway.gateway.feeds["modbus"]
-    assert reload(gateway, MODBUS.format(first, 21)) == IN_EFFECT
+    assert gateway.reload(MODBUS.format(first, 21)) == IN_EFFECT
     # the table is unchanged, so the server and its clients stay
     assert gateway.gateway.feeds["modbus"] is server
-    assert reload(gateway, MODBUS.format(second, 22)) == IN_EFFECT
+    assert gateway.reload(MODBUS.format(second, 22)) == IN_EFFECT
     until(lambda: status_of(second, 22) == [3])
     until(lambda: not is_open(first))
-    assert reload(gateway, "") == IN_EFFECT
+    assert gateway.reload("") == IN_EFFECT
     until(lambda: not is_open(second))
     assert parts(gateway) == {}
 
 
 def test_a_reload_changes_nothing_if_a_gateway_part_cannot_be_opened(gateway: Served) -> None:
     first = free_port()
-    assert reload(gateway, MODBUS.format(first, 21))["done"] is True
+    assert gateway.reload(MODBUS.format(first, 21))["done"] is True
     with socket.create_server(("127.0.0.1", 0)) as taken:
         number = taken.getsockname()[1]
         path = gateway.gateway.plant.path
         path.write_text(path.read_text().replace('"pump-2"', '"fan-2"'))
-        told = reload(gateway, MODBUS.format(number, 22) + '[serve.history]\nfolder = "h"\n')
+        told = gateway.reload(MODBUS.format(number, 22) + '[serve.history]\nfolder = "h"\n')
     assert told["done"] is False
     assert told["text"] == "the previous plant stays in use: the file has mistakes"
     (mistake,) = told["mistakes"]
@@ -100,7 +91,7 @@ def test_a_reload_is_cancelled_if_a_server_of_the_gateway_cannot_start(
     gateway: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = free_port()
-    assert reload(gateway, MODBUS.format(first, 21))["done"] is True
+    assert gateway.reload(MODBUS.format(first, 21))["done"] is True
     build, failures = parts_module.build, [MemoryError("no memory")]
 
     def build_or_fail(*arguments: Any) -> Any:
@@ -109,7 +100,7 @@ def test_a_reload_is_cancelled_if_a_server_of_the_gateway_cannot_start(
         return build(*arguments)
 
     monkeypatch.setattr(parts_module, "build", build_or_fail)
-    assert reload(gateway, MODBUS.format(free_port(), 22))["mistakes"] == ["no memory"]
+    assert gateway.reload(MODBUS.format(free_port(), 22))["mistakes"] == ["no memory"]
     assert parts(gateway) == {"modbus": "ok"}
     until(lambda: status_of(first, 21) == [3])
 
@@ -120,7 +111,7 @@ def test_a_modbus_port_lost_during_a_failed_reload_is_reported(
 ) -> None:
     """The reload fails. Meanwhile, another program has opened the previous port of the Modbus server."""
     first = free_port()
-    assert reload(gateway, MODBUS.format(first, 21))["done"] is True
+    assert gateway.reload(MODBUS.format(first, 21))["done"] is True
     others = []
 
     def fail(plant: object) -> None:
@@ -128,14 +119,14 @@ def test_a_modbus_port_lost_during_a_failed_reload_is_reported(
         raise RuntimeError("no memory")
 
     monkeypatch.setattr(gateway.gateway.poller, "adopt", fail)
-    assert reload(gateway, MODBUS.format(free_port(), 22))["mistakes"] == ["no memory"]
+    assert gateway.reload(MODBUS.format(free_port(), 22))["mistakes"] == ["no memory"]
     others[0].close()
     told = parts(gateway)["modbus"]
     assert told.startswith(f"[serve.modbus]: listen: 127.0.0.1:{first} cannot be opened")
     stopped = gateway.post("/api/stop", {}, **gateway.writer).json
     assert [one["done"] for one in stopped.values()] == [True, True]
     monkeypatch.undo()
-    assert reload(gateway, MODBUS.format(first, 21)) == IN_EFFECT
+    assert gateway.reload(MODBUS.format(first, 21)) == IN_EFFECT
     until(lambda: status_of(first, 21) == [3])
     assert parts(gateway) == {"modbus": "ok"}
 
@@ -154,7 +145,7 @@ def test_a_stop_is_sent_while_a_reload_waits_for_the_history(
 
     monkeypatch.setattr(parts_module, "build", slow)
     told: list[Any] = []
-    reloading = threading.Thread(target=lambda: told.append(reload(gateway, "[serve.history]\n")))
+    reloading = threading.Thread(target=lambda: told.append(gateway.reload("[serve.history]\n")))
     reloading.start()
     assert opens.wait(PATIENCE)
     stopped = gateway.post("/api/stop", authorization=gateway.bearer(Right.STOP)).json
@@ -169,11 +160,11 @@ def test_a_stop_is_sent_while_a_reload_waits_for_the_history(
 def test_a_reload_can_start_change_or_end_the_history(gateway: Served, tmp_path: Path) -> None:
     assert gateway.get("/api/export?from=0&to=1&series=pump-1.status").status == 404
     for folder in ("first", "second"):
-        assert reload(gateway, f'[serve.history]\nfolder = "{folder}"\n') == IN_EFFECT
+        assert gateway.reload(f'[serve.history]\nfolder = "{folder}"\n') == IN_EFFECT
         until(lambda folder=folder: any((tmp_path / folder).glob("*.arrows")))
         history = gateway.gateway.feeds["history"]
         until(lambda history=history: history.state.rows > 0)
-    assert reload(gateway, "") == IN_EFFECT
+    assert gateway.reload("") == IN_EFFECT
     assert history.state.trouble is None
     assert gateway.get("/api/export?from=0&to=1&series=pump-1.status").status == 404
 
@@ -187,12 +178,12 @@ def test_a_reload_can_start_change_or_end_mqtt(gateway: Served, tmp_path: Path) 
             heard.wait_for(lambda one: (one.topic, one.payload) == (topic, payload))
 
         table = f'[serve.mqtt]\nbroker = "{broker.address}"\nprefix = '
-        assert reload(gateway, table + '"old"\n') == IN_EFFECT
+        assert gateway.reload(table + '"old"\n') == IN_EFFECT
         says("old/gateway", b"online")
-        assert reload(gateway, table + '"new"\n') == IN_EFFECT
+        assert gateway.reload(table + '"new"\n') == IN_EFFECT
         says("old/gateway", b"offline")
         says("new/gateway", b"online")
-        assert reload(gateway, "") == IN_EFFECT
+        assert gateway.reload("") == IN_EFFECT
         says("new/gateway", b"offline")
 
 

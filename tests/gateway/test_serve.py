@@ -22,6 +22,7 @@ from commands import MULTIDROP, BoundProcess, Run, multidrop
 from gateways import (
     Served,
     certificate,
+    gateway_of,
     get,
     plant_text,
     running,
@@ -34,7 +35,7 @@ from gateways import (
 from lines import PATIENCE, until
 from tables import table
 
-from multidrop import InvtCHE, Plant
+from multidrop import InvtCHE
 from multidrop.cli import serve as serve_command
 from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.http.connections import listen
@@ -109,8 +110,7 @@ def test_sighup_reloads_the_plant_file_and_notifies_systemd(tmp_path: Path) -> N
 def test_a_plant_without_a_file_cannot_be_reloaded(tmp_path: Path) -> None:
     with served(tmp_path) as gateway:
         gateway.gateway.reload._read = None
-        writer = {"authorization": gateway.bearer(Right.WRITE)}
-        told = gateway.post("/api/reload", {"confirm": True}, **writer).json
+        told = gateway.reload()
         assert (told["done"], told["text"]) == (
             False,
             "this plant was not read from a file, so it cannot be reloaded",
@@ -314,8 +314,7 @@ def test_a_line_is_polled_as_soon_as_its_missing_port_appears(tmp_path: Path) ->
         text = plant_text(simulator.wires[0].path, ["pump-1"])
         text += plant_text(str(port), ["fan-1"], SERVE).replace('"hall"', '"roof"')
         (tmp_path / "plant.toml").write_text(text)
-        plant = Plant.load(tmp_path / "plant.toml")
-        gateway = Gateway(plant, read_settings(plant, {}))
+        gateway = gateway_of(tmp_path / "plant.toml")
         with running(gateway):
             served = Served(gateway, dict(zip(("pump-1", "fan-1"), sims, strict=True)), tokens()[0])
             served.await_state("pump-1", "stands")
@@ -342,8 +341,7 @@ def test_a_line_is_polled_as_soon_as_its_missing_port_appears(tmp_path: Path) ->
 @pytest.mark.slow
 def test_the_health_report_says_why_a_port_was_lost_after_the_start(tmp_path: Path) -> None:
     port = tmp_path / "hall"
-    plant = written(tmp_path, SERVE, port=str(port))
-    gateway = Gateway(plant, read_settings(plant, {}))
+    gateway = gateway_of(written(tmp_path, SERVE, port=str(port)).path)
     with ExitStack() as stack:
         with Simulator([Wire([simulated(InvtCHE(1, baudrate=38400))], unpaced=True, port=str(port))]):
             stack.enter_context(running(gateway))

@@ -6,14 +6,13 @@ import json
 import logging
 import threading
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 from batches import SECOND, UTC_0, add_rows, completion
 from commands import Run
-from gateways import POLL, Served, plant_text, running, served, written
+from gateways import POLL, Served, gateway_of, plant_text, running, served, written
 from lines import until
 from tables import table
 
@@ -25,7 +24,6 @@ from multidrop.errors import Advice
 from multidrop.families import MODELS
 from multidrop.families.erman_er_g_220 import ErmanFault
 from multidrop.gateway.commands import in_words
-from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.http.rights import Right
 from multidrop.gateway.live.alarm_file import AlarmFile, alarm_in
 from multidrop.gateway.live.alarms import Alarm, Alarms, Limit, Limits
@@ -369,8 +367,7 @@ def test_an_unwritable_alarm_file_is_reported_in_health(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_a_lost_port_raises_one_alarm_for_its_line(tmp_path: Path) -> None:
     (tmp_path / "plant.toml").write_text(plant_text(str(tmp_path / "none"), ["pump-1", "pump-2"]))
-    plant = Plant.load(tmp_path / "plant.toml")
-    gateway = Gateway(plant, replace(read_settings(plant, {}), port=0))
+    gateway = gateway_of(tmp_path / "plant.toml")
     with running(gateway):
         page = Served(gateway, {}, {})
         page.await_state("pump-1", "silent")

@@ -17,7 +17,7 @@ from tempfile import mkdtemp
 from typing import Any
 
 import pytest
-from gateways import gateway_of
+from gateways import gateway_of, running
 from lines import until
 from modbus_tools import Libmodbus, Mbpoll, Pymodbus, PyModbusTcp
 from tables import usually
@@ -186,7 +186,7 @@ def served(folder: Path, passing: str = "declared") -> Iterator[tuple[Any, Simul
     with Simulator([Wire([one], unpaced=True) for one in drives]) as simulator:
         hall, yard = (wire.path for wire in simulator.wires)
         path.write_text(PLANT.format(passing=passing, hall=hall, yard=yard))
-        with gateway_of(path) as gateway:
+        with running(gateway := gateway_of(path)):
             until(lambda: all(gateway.hub.last_answer(name) for name in ("mill", "meter")))
             yield gateway, drives[0]
 

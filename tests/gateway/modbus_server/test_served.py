@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from gateways import Served, gateway_of, served
+from gateways import Served, gateway_of, running, served
 from lines import until
 from modbus_gateway import RawClient, RawReply, plant_of, request
 from modbus_tools import Libmodbus, Mbpoll, Minimalmodbus, Pymodbus
@@ -79,7 +79,7 @@ def reply_to(client: RawClient, *words: int) -> RawReply:
 
 @pytest.mark.slow
 def test_modbus_clients_can_read_change_and_stop_drives_of_a_plant_file(tmp_path: Path) -> None:
-    with simulated_plant(tmp_path) as (drive, path), gateway_of(path) as gateway:
+    with simulated_plant(tmp_path) as (drive, path), running(gateway := gateway_of(path)):
         drive["output_voltage"] = 231
         server: Any = gateway.feeds["modbus"]
         with RawClient(server.ports[""]) as client:
@@ -106,7 +106,7 @@ def test_a_tcp_port_in_use_is_reported_before_polling_starts(tmp_path: Path) -> 
         number = taken.getsockname()[1]
         path.write_text(path.read_text().replace(':0"\nmay', f':{number}"\nmay'))
         sentence = f"127.0.0.1:{number} cannot be opened: another program"
-        with pytest.raises(ValueError, match=sentence), gateway_of(path):
+        with pytest.raises(ValueError, match=sentence), running(gateway_of(path)):
             pass
         assert drive.counters.requests == 0
 

@@ -11,7 +11,6 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -20,16 +19,15 @@ import pytest
 from brokers import Broker as BrokerProcess
 from brokers import Broker as RunningBroker
 from brokers import Listener, Running, has, mosquitto, nats
-from gateways import Served, plant_text, running, tokens
+from gateways import Served, gateway_of, plant_text, running, tokens
 from lines import HOST_LATE, until
 from nats_clusters import old_server_program
 from peers import require_module
 from tables import usually
 
-from multidrop import Batch, InvtCHE, Plant
+from multidrop import Batch, InvtCHE
 from multidrop.control import CommandOutcome, CommandResult
 from multidrop.gateway.commands import Admit
-from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.http.rights import Caller, Right
 from multidrop.gateway.mqtt import broker_commands
 from multidrop.gateway.mqtt.broker import (
@@ -43,7 +41,6 @@ from multidrop.gateway.mqtt.broker import (
     parse_broker,
 )
 from multidrop.gateway.mqtt.broker_commands import MOST_COMMANDS, BrokerCommands
-from multidrop.gateway.settings import read_settings
 from multidrop.sim import Simulator, Wire, simulated
 
 
@@ -255,14 +252,13 @@ class Slots:
 
 
 @contextmanager
-def gateway_of(folder: Path, broker: BrokerProcess) -> Iterator[tuple[Served, Slots]]:
+def with_slots(folder: Path, broker: BrokerProcess) -> Iterator[tuple[Served, Slots]]:
     sims = {name: simulated(InvtCHE(n, name=name, baudrate=38400)) for n, name in enumerate(DRIVES, 1)}
     with Simulator([Wire(list(sims.values()), unpaced=True)]) as simulator:
         text = plant_text(simulator.wires[0].path, DRIVES, SERVE.format(broker.address))
         path = folder / "plant.toml"
         path.write_text(text.replace('every = "100 ms"', f'every = "{PERIOD_S * 1000:g} ms"'))
-        plant = Plant.load(path)
-        gateway, slots = Gateway(plant, replace(read_settings(plant, {}), port=0)), Slots()
+        gateway, slots = gateway_of(path), Slots()
         gateway.feeds["slots"] = slots
         with running(gateway):
             yield Served(gateway, sims, tokens()[0]), slots
@@ -293,7 +289,7 @@ def watched(slots: Slots) -> dict[str, list[Slot]]:
 @pytest.mark.parametrize("kind", usually("gone", "frozen"))
 def test_polling_is_unchanged_while_the_mqtt_broker_is_frozen_or_gone(tmp_path: Path, kind: str) -> None:
     require_module("paho.mqtt.client")
-    with mosquitto(tmp_path) as broker, gateway_of(tmp_path, broker) as (gateway, slots):
+    with mosquitto(tmp_path) as broker, with_slots(tmp_path, broker) as (gateway, slots):
         until(lambda: figures(gateway)["connected"] == 2.0)
         until(lambda: len(slots.between(0, time.monotonic_ns())) == len(DRIVES))
         assert gateway.get("/health").json["parts"]["mqtt"] == "ok"

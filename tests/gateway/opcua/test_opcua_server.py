@@ -382,8 +382,7 @@ def test_a_reload_removes_and_adds_opc_ua_objects_of_drives(tmp_path: Path) -> N
         subscription.subscribe_data_change(client.get_node("ns=2;s=pump-2.output_frequency"))
         path = tmp_path / "plant.toml"
         path.write_text(path.read_text().replace('"pump-2', '"fan'))
-        writer = {"authorization": gateway.bearer(Right.WRITE)}
-        assert gateway.post("/api/reload", {"confirm": True}, **writer).json["done"] is True
+        assert gateway.reload()["done"] is True
         until(lambda: code(client, "fan.output_frequency") == "Good")
         assert code(client, "pump-2.output_frequency") == "BadNodeIdUnknown"
         until(lambda: Notes.codes[-1:] == ["BadNodeIdUnknown"])

@@ -27,7 +27,7 @@ from multidrop.gateway import settings as settings_module
 from multidrop.gateway.gateway import Gateway
 from multidrop.gateway.http.rights import Right, Token, new_token
 from multidrop.gateway.live import frames
-from multidrop.gateway.settings import ServeSettings, read_plant, read_settings
+from multidrop.gateway.settings import ServeSettings, read_plant
 from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
 
 for module, name in (  # timeouts for a busy machine
@@ -109,6 +109,20 @@ class Served:
         body = {"drive": drive, "verb": verb, "options": options}
         return self.command("/api/act", body, **self.writer).json
 
+    def reload(self, serve: str | None = None) -> Any:
+        """Reload the plant file, and wait for a frame of it; return the JSON of the answer.
+
+        If `serve` is given, it first replaces the `[serve]` tables of the file.
+        """
+        if serve is not None:
+            path = self.gateway.plant.path
+            path.write_text(path.read_text().partition("[serve")[0] + serve)
+        answer = self.post("/api/reload", {"confirm": True}, **self.writer)
+        assert answer.status == 200
+        looker = self.writer
+        until(lambda: self.get("/api/frame", **looker).json["revision"] == self.gateway.revision)
+        return answer.json
+
     def start(self, *drives: str) -> None:
         for drive in drives:
             assert self.write(drive, "setpoint", 50.0)["done"] is True
@@ -170,6 +184,16 @@ def written(folder: Path, serve: str = "", *drives: str, port: str = "/dev/ttyUS
     return Plant.load(path)
 
 
+def gateway_of(path: Path, environment: Mapping[str, str] | None = None, **settings: Any) -> Gateway:
+    """Return a gateway that can reload its plant file; `settings` override those of the file."""
+
+    def read() -> tuple[Plant, ServeSettings]:
+        plant, found = read_plant(lambda: Plant.load(path), environment or {})
+        return plant, replace(found, **{"port": 0, **settings})
+
+    return Gateway(*read(), read=read)
+
+
 @contextmanager
 def served(
     folder: Path, serve: str = "", *drives: str, environment: Mapping[str, str] | None = None, **settings: Any
@@ -180,24 +204,10 @@ def served(
     secrets, known = tokens()
     (folder / "tokens").write_text("".join(f"{token.line}\n" for token in known))
     with Simulator([Wire(list(sims.values()), unpaced=True)]) as simulator:
-        written(folder, serve, *names, port=simulator.wires[0].path)
-
-        def read() -> tuple[Plant, ServeSettings]:
-            plant, found = read_plant(lambda: Plant.load(folder / "plant.toml"), environment or {})
-            return plant, replace(found, port=0, **{"tokens": known, **settings})
-
-        gateway = Gateway(*read(), read=read)
+        path = written(folder, serve, *names, port=simulator.wires[0].path).path
+        gateway = gateway_of(path, environment, **{"tokens": known, **settings})
         with running(gateway) as loop:
             yield Served(gateway, sims, secrets, loop)
-
-
-@contextmanager
-def gateway_of(path: Path) -> Iterator[Gateway]:
-    """Run the gateway of a plant file in a thread."""
-    plant = Plant.load(path)
-    gateway = Gateway(plant, read_settings(plant, {}))
-    with running(gateway):
-        yield gateway
 
 
 @contextmanager
