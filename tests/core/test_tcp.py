@@ -26,7 +26,7 @@ from multidrop.core import (
     Message,
     Peer,
     Port,
-    Transactions,
+    TransactionIds,
     build_reply,
     build_request,
     parse_reply,
@@ -144,7 +144,7 @@ def test_a_damaged_tcp_reply_has_the_expected_fault(damaged: str, fault: FrameFa
 
 @pytest.fixture
 def line() -> LineDriver:
-    return LineDriver(Transactions.MATCHED)
+    return LineDriver(TransactionIds.MATCH)
 
 
 @pytest.fixture
@@ -223,7 +223,7 @@ def test_late_doubled_and_foreign_replies_are_never_accepted(line: LineDriver, d
 
 def test_each_request_gets_its_own_reply_in_any_order(drive: Peer) -> None:
     for seed in range(200):
-        chance, line = Random(seed), LineDriver(Transactions.MATCHED)
+        chance, line = Random(seed), LineDriver(TransactionIds.MATCH)
         missed = [miss(line, drive) for _ in range(chance.randrange(5))]
         own = ask(line, drive)
         came = [value(each, 1000 + at) for at, each in enumerate(missed)] * 2 + [value(own, 7)] * 2
@@ -330,9 +330,9 @@ def test_wrong_length_in_a_tcp_header_fails_only_one_exchange(
 
 
 @pytest.mark.parametrize("missing", range(1, 10))
-@pytest.mark.parametrize("transactions", [Transactions.MATCHED, Transactions.IGNORED])
+@pytest.mark.parametrize("transactions", [TransactionIds.MATCH, TransactionIds.IGNORE])
 def test_short_tcp_reply_fails_only_one_exchange(
-    drive: Peer, missing: int, transactions: Transactions
+    drive: Peer, missing: int, transactions: TransactionIds
 ) -> None:
     line = LineDriver(transactions)
     assert is_read(line, drive, 1)
@@ -418,8 +418,8 @@ def test_memory_stays_limited_while_endless_foreign_frames_arrive(line: LineDriv
     assert line.completion.reply.data == words(7)
 
 
-@given(st.lists(st.binary(max_size=40), max_size=20), st.sampled_from(list(Transactions)[1:]))
-def test_every_exchange_ends_whatever_bytes_come(pieces: list[bytes], transactions: Transactions) -> None:
+@given(st.lists(st.binary(max_size=40), max_size=20), st.sampled_from(TransactionIds))
+def test_every_exchange_ends_whatever_bytes_come(pieces: list[bytes], transactions: TransactionIds) -> None:
     line, drive = LineDriver(transactions), Peer(least_timeout=LEAST / 1e9, most_timeout=MOST / 1e9)
     for piece in pieces:
         line.begin(exchange(READ, drive))
@@ -436,7 +436,7 @@ def test_every_exchange_ends_whatever_bytes_come(pieces: list[bytes], transactio
 
 @pytest.fixture
 def gateway() -> LineDriver:
-    return LineDriver(Transactions.IGNORED)
+    return LineDriver(TransactionIds.IGNORE)
 
 
 def test_a_reply_with_another_id_is_accepted_if_transaction_ids_are_ignored(
@@ -482,7 +482,7 @@ def test_a_tcp_connection_is_lost_if_bytes_of_another_protocol_arrive(
     ends: tuple[socket.socket, socket.socket], drive: Peer
 ) -> None:
     ours, theirs = ends
-    port = Port(ours.fileno(), -1, transactions=Transactions.MATCHED)
+    port = Port(ours.fileno(), -1, transactions=TransactionIds.MATCH)
     try:
         theirs.send(bytes.fromhex("01 03 02 00 07 F9 86"))
         found = port.carry_out(exchange(READ, drive))

@@ -68,7 +68,6 @@ from multidrop.core.port import RowQueue as RowQueue
 from multidrop.core.port import RS485Mode as RS485Mode
 from multidrop.core.port import TransactionIds as TransactionIds
 from multidrop.core.port import TransactionMode as TransactionMode
-from multidrop.core.port import Transactions as Transactions
 from multidrop.core.port import close_behind as close_behind
 from multidrop.core.port import get_settings as get_settings
 from multidrop.core.port import is_pseudo_terminal as is_pseudo_terminal

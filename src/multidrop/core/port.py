@@ -8,7 +8,7 @@ import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from enum import IntEnum, StrEnum
+from enum import StrEnum
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -137,14 +137,12 @@ class TransactionIds(StrEnum):
 
 TransactionMode = TransactionIds | Literal["match", "ignore"]
 
-
-class Transactions(IntEnum):
-    """How a port uses transaction ids (enum md_transactions)."""
-
-    NONE = lib.MD_NO_TRANSACTIONS  # no transaction ids: every framing except Modbus TCP
-    MATCHED = lib.MD_MATCHED  # a reply has the id of its request; replies with other ids are late or foreign
-    IGNORED = lib.MD_IGNORED  # a gateway replies with its own ids
-
+# None: no transaction ids, as with every framing except Modbus TCP
+TRANSACTIONS = {
+    None: lib.MD_NO_TRANSACTIONS,
+    TransactionIds.MATCH: lib.MD_MATCHED,
+    TransactionIds.IGNORE: lib.MD_IGNORED,
+}
 
 _ECHOES = {Echo.AUTO: lib.MD_ECHO_UNKNOWN, Echo.ON: lib.MD_ECHO, Echo.OFF: lib.MD_NO_ECHO}
 
@@ -413,7 +411,7 @@ class Port:
 
     `must_take` is a mask (of REFUSALS): the settings that the port must not refuse. It is -1 for a port that
     has no settings, such as a socket. `room` is the length of the queue, a power of two. `transactions` is
-    NONE for every framing except Modbus TCP. With a `mastership`, requests are sent only before its deadline.
+    None for every framing except Modbus TCP. With a `mastership`, requests are sent only before its deadline.
 
     Raises OSError if the descriptor cannot be polled.
     """
@@ -424,13 +422,13 @@ class Port:
         must_take: int,
         room: int = 256,
         *,
-        transactions: Transactions = Transactions.NONE,
+        transactions: TransactionIds | None = None,
         mastership: Mastership | None = None,
     ) -> None:
         self.room = room
         self._memory = _PortMemory(room, mastership)
         self._is_inherited = False
-        self.c = lib.md_port_open(_engine.c, fd, must_take, transactions, room)
+        self.c = lib.md_port_open(_engine.c, fd, must_take, TRANSACTIONS[transactions], room)
         if self.c == ffi.NULL:
             raise OSError(ffi.errno, "the core cannot watch the port")
         self._owner = _owner_of(self.c, self._memory)
@@ -522,10 +520,8 @@ class Port:
     def repeat(self, exchanges: Sequence[Exchange]) -> int:
         """Carry out these exchanges in turn, whenever no queued exchange is due, until the next call.
 
-        Return which of the previous exchanges would have come next, as an index; 0 on a closed port.
+        Return which of the previous exchanges would have come next, as an index.
         """
-        if self.c is None:
-            return 0
         # keep old exchanges alive too: one may still be in flight after new exchanges have replaced it
         self._memory.lasting.update(exchanges)
         rounds = ffi.new("struct md_exchange *[]", [exchange.c for exchange in exchanges])

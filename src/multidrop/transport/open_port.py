@@ -23,7 +23,6 @@ from multidrop.core import (
     Mastership,
     Port,
     TransactionIds,
-    Transactions,
     close_behind,
     is_pseudo_terminal,
     must_take,
@@ -218,7 +217,6 @@ CLOSING_S = 0.75  # seconds in which a stalled adapter must take the driver's by
 _UNNOTICED_S = 0.05  # s; a healthy adapter takes all bytes of the driver within this time
 BY_PLACE = "/dev/serial/by-path/"  # links whose names state the USB socket, not the adapter
 _NO_SETTINGS = -1
-_TRANSACTIONS = {TransactionIds.MATCH: Transactions.MATCHED, TransactionIds.IGNORE: Transactions.IGNORED}
 
 
 def _refusal(rs485: RS485, failure: OSError) -> str:
@@ -321,7 +319,7 @@ class OpenPort:
             discard_late_bytes(connection)
         if connection and not is_bridged(port):
             connection.setblocking(False)
-            ids = _TRANSACTIONS[self._ids] if speaks_tcp(self.name) else Transactions.NONE
+            ids = self._ids if speaks_tcp(self.name) else None
             return Port(connection.fileno(), _NO_SETTINGS, transactions=ids, mastership=self._mastership)
         if self.settings:
             set_up(port, self.settings)

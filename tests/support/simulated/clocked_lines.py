@@ -20,7 +20,8 @@ from lines import PATIENCE, line, plant, rows_of
 from multidrop._core import ffi, lib
 
 from multidrop import bus, poller
-from multidrop.core import Completion, Exchange, Message, Peer, RowQueue, TransactionIds, Transactions
+from multidrop.core import Completion, Exchange, Message, Peer, RowQueue, TransactionIds
+from multidrop.core.port import TRANSACTIONS
 from multidrop.drive import Drive
 from multidrop.drive.line_settings import speaks_tcp
 from multidrop.errors import LineError
@@ -36,13 +37,6 @@ S = 1_000_000_000
 BEGIN_NS = 1000 * S
 NEVER = 1 << 62
 ENODEV = 19
-
-
-def transactions_of(line: Any) -> Transactions:
-    """Return how the line uses transaction ids, as transport/line.py would pass it to the core."""
-    if not line.is_tcp:
-        return Transactions.NONE
-    return Transactions.MATCHED if line.ids is TransactionIds.MATCH else Transactions.IGNORED
 
 
 class ClockedWire(FaultyWire):
@@ -93,7 +87,7 @@ class ClockedPort:
     room = 256
     switching = 0.0
 
-    def __init__(self, clocked: PortSurroundings, transactions: Transactions = Transactions.NONE) -> None:
+    def __init__(self, clocked: PortSurroundings, transactions: TransactionIds | None = None) -> None:
         self._clocked = clocked
         self._slots = ffi.new("struct md_slot[]", self.room)
         self._turn = ffi.new("struct md_turn *")
@@ -104,7 +98,7 @@ class ClockedPort:
         self._guard = threading.RLock()  # locks the port, as the engine's mutex does
         self._is_closed = False
         lib.md_turn_init(self._turn, self._slots, self.room, clocked.now)
-        self._turn.line.transactions = transactions
+        self._turn.line.transactions = TRANSACTIONS[transactions]
         if transactions:
             lib.md_turn_set_echo(self._turn, lib.MD_NO_ECHO)
 
@@ -276,7 +270,7 @@ class ClockedLine:
         wire = self._clocked.wires.get(self.port)
         if wire is None or wire.port is None:
             raise LineError(self.port, "it is not there")
-        self.queue = self._clocked.ports[self.port] = ClockedPort(self, transactions_of(self))
+        self.queue = self._clocked.ports[self.port] = ClockedPort(self, self.ids if self.is_tcp else None)
         self._clocked.opened.append(self.port)
 
     def open(self) -> ClockedLine:

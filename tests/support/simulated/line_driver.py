@@ -9,7 +9,8 @@ from batches import copied, new_completion
 from frames import words
 from multidrop._core import ffi, lib
 
-from multidrop.core import Completion, Exchange, Failure, Framing, Message, Peer, Transactions, build_reply
+from multidrop.core import Completion, Exchange, Failure, Framing, Message, Peer, TransactionIds, build_reply
+from multidrop.core.port import TRANSACTIONS
 
 MS = 1_000_000
 
@@ -17,11 +18,11 @@ MS = 1_000_000
 class LineDriver:
     """Runs exchanges on a struct md_line; `now` is in ns and advances only by calls."""
 
-    def __init__(self, transactions: Transactions = Transactions.NONE) -> None:
+    def __init__(self, transactions: TransactionIds | None = None) -> None:
         self.now = 1000 * MS
         self._line = ffi.new("struct md_line *")
         lib.md_line_init(self._line, self.now)
-        self._line.transactions = transactions
+        self._line.transactions = TRANSACTIONS[transactions]
         self.found = new_completion()
         self._exchanges: list[Exchange] = []  # keeps exchanges alive that the line refers to
 

@@ -9,7 +9,7 @@ from random import Random
 from typing import Any
 
 import pytest
-from clocked_lines import BEGIN_NS, NEVER, ClockedLines, ClockedPort, ClockedWire, transactions_of
+from clocked_lines import BEGIN_NS, NEVER, ClockedLines, ClockedPort, ClockedWire
 from lines import polled, proof, proofs, rows_of
 from motors import REASONS
 
@@ -230,7 +230,7 @@ class PathLine:
         self.has_echo = self.is_lost = self.is_stalled = False
         self.may_send = True  # always True: this line needs no right to send
         self.is_tcp, self.ids = speaks_tcp(self.port), wire.ids
-        self.queue = ClockedPort(self, transactions_of(self))
+        self.queue = ClockedPort(self, self.ids if self.is_tcp else None)
 
     def require(self, settings: tuple[int, str]) -> None:
         pass
