@@ -345,16 +345,6 @@ def test_a_write_to_a_write_only_register_is_unconfirmed_without_a_reply() -> No
 
 
 @pytest.mark.slow
-def test_a_write_is_sent_at_most_once_if_the_drive_never_replies() -> None:
-    rig = simulated(Rig(1))
-    with faulty(rig, losing(0x03, 0x06)) as sim, Bus(path(sim)) as bus:
-        ours = bus.attach(Rig, 1)
-        with pytest.raises((Unconfirmed, NoReply)):
-            ours.write(ours.gain, 2.0)
-    assert sent(rig).get(0x06, 0) <= 1
-
-
-@pytest.mark.slow
 def test_a_read_of_a_silent_drive_is_retried_a_few_times() -> None:
     rig = simulated(Rig(1))
     with faulty(rig, losing(0x03)) as sim, Bus(path(sim)) as bus:

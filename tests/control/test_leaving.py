@@ -42,10 +42,13 @@ def pair() -> Iterator[RunningPair]:
     made.bus.close()
 
 
-def test_a_bus_shows_whether_stop_on_exit_was_called(pair: RunningPair) -> None:
+def test_a_bus_shows_whether_it_stops_drives_on_exit(pair: RunningPair) -> None:
     assert pair.bus.stops_on_exit is False
     pair.bus.stop_on_exit()
     assert pair.bus.stops_on_exit is True
+    line = SimulatedBus(simulated(InvtCHE(1)), stop_on_exit=True)
+    assert line.bus.stops_on_exit is True
+    line.bus.close()
 
 
 def test_leave_stops_all_drives_immediately(pair: RunningPair) -> None:
@@ -132,12 +135,6 @@ def test_closing_a_bus_waits_for_stops_unless_repeated_signals_end_the_wait(
     pair.bus.part()
     assert pair.turning == [False, False]
     assert waited == ([] if is_cut_short else [()])
-
-
-def test_stop_on_exit_can_be_passed_as_a_bus_argument() -> None:
-    line = SimulatedBus(simulated(InvtCHE(1)), stop_on_exit=True)
-    assert line.bus.stops_on_exit
-    line.bus.close()
 
 
 def test_a_bus_with_stop_on_exit_can_only_be_made_on_the_main_thread(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -145,15 +145,6 @@ def test_a_stop_sent_as_a_register_write_is_recorded(tmp_path: Path) -> None:
     line.bus.close()
 
 
-def test_a_raw_request_is_recorded_immediately(tmp_path: Path) -> None:
-    line, drive, _ = one(InvtCHE(1), audit=tmp_path / "audit")
-    assert line.bus.audit_trouble == ""
-    drive.send_raw(6, 0x1000, b"\0\5")
-    (entry,) = read_audit(tmp_path / "audit")
-    assert (entry["sent"], entry["outcome"]) == ("01 06 10 00 00 05 4D 09", "done")
-    line.bus.close()
-
-
 def test_no_read_is_sent_for_an_expired_write() -> None:
     line, drive, _ = one(InvtCHE(1, maximum_frequency=50))
     with written_before(lambda: 0.0), pytest.raises(Expired, match=r"setpoint = 10\.00 %"):

@@ -263,25 +263,18 @@ def test_a_simulated_write_is_counted_if_the_port_seems_real(monkeypatch: pytest
 # ---- the audit log ----
 
 
-def test_a_refused_raw_request_is_recorded_as_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize("outcome", ["done", "unconfirmed", "refused by the drive"])
+def test_the_outcome_of_a_raw_request_is_recorded_immediately(tmp_path: Path, outcome: str) -> None:
     line, drive, _ = one(InvtCHE(1), audit=tmp_path / "audit")
-    line.refuses = lambda request: 0x12 if request.function == 6 else 0
-    with pytest.raises(DriveException, match="code 12H"):
+    line.loses = lambda request: outcome == "unconfirmed"
+    line.refuses = lambda request: 0x12 if request.function == 6 and outcome.startswith("refused") else 0
+    failure = {"unconfirmed": Unconfirmed, "refused by the drive": DriveException}.get(outcome)
+    with pytest.raises(failure) if failure else nullcontext():
         drive.send_raw(6, 0x1000, b"\0\5")
-    line.bus.close()
-    assert [entry["outcome"] for entry in read_audit(tmp_path / "audit")] == ["refused by the drive"]
-
-
-@pytest.mark.parametrize("is_lost", [False, True])
-def test_the_outcome_of_a_raw_request_is_recorded(tmp_path: Path, is_lost: bool) -> None:
-    line, drive, _ = one(YD1000(1), audit=tmp_path / "audit")
-    line.loses = lambda request: is_lost
-    with pytest.raises(Unconfirmed) if is_lost else nullcontext():
-        drive.send_raw(6, 0x0000, b"\x00\x01")
-    line.bus.close()
     (entry,) = read_audit(tmp_path / "audit")
-    assert entry["write"] == "raw request 01 06 00 00 00 01 48 0A"
-    assert entry["outcome"] == ("unconfirmed" if is_lost else "done")
+    line.bus.close()
+    assert (entry["write"], entry["outcome"]) == ("raw request 01 06 10 00 00 05 4D 09", outcome)
+    assert entry["sent"] == "01 06 10 00 00 05 4D 09"
 
 
 def test_the_audit_log_records_every_write(tmp_path: Path) -> None:

@@ -214,12 +214,6 @@ def test_the_error_explains_the_exception_code_of_the_family() -> None:
     assert len(line.written) == 1
 
 
-def test_the_watchdog_text_of_the_family_is_used_if_a_read_fails() -> None:
-    line, drive, _ = one(YD1000(1))
-    line.refuses = lambda request: 2 if request.function == 3 else 0
-    assert line.bus.watchdog(drive) == drive.watchdog
-
-
 def test_an_expired_write_is_not_sent() -> None:
     line, drive, _ = one(InvtCHE(1, maximum_frequency=50))
     drive.set_frequency(20)
@@ -428,6 +422,8 @@ def test_the_watchdog_setting_is_read_from_the_drive_if_readable() -> None:
     )
     sim["communication_timeout"] = 5
     assert line.bus.watchdog(drive) == "its watchdog (communication_timeout) acts 5 s after the last message"
+    line.refuses = lambda request: 2
+    assert line.bus.watchdog(drive) == drive.watchdog
     line, drive, _ = one(ErmanERG220(1))
     assert "no watchdog" in line.bus.watchdog(drive)
     assert line.written == []

@@ -163,20 +163,6 @@ def test_an_invalid_time_limit_prevents_writes_but_not_stops(limit: Any) -> None
     assert len(written(line)) == 1
 
 
-def check_not_sent(tmp_path: Path, model: str, hold_up: Callable[[SimulatedBus], None]) -> None:
-    """Check that a start delayed at any of its reads is not sent."""
-    for frames in range(1, 100):
-        line, _, meanwhile, begun, failure = started_while(
-            tmp_path, model, frames, lambda line, drive: hold_up(line)
-        )
-        start = first(line, begun, STARTS[model])
-        if not meanwhile.has_come or (start is not None and start < frames):
-            break
-        assert start is None
-        assert isinstance(failure, Expired)
-    assert frames > 2
-
-
 class Looking(Own):
     """A drive whose start reads twenty times before it writes."""
 
@@ -193,20 +179,30 @@ class Resting(Own):
     least_interval = 5.0
 
 
-@table("model", MAKE)
-def test_a_start_is_not_sent_if_the_process_was_suspended_during_checks(tmp_path: Path, model: str) -> None:
-    """The process is suspended at each read, as by Ctrl-Z."""
-    check_not_sent(tmp_path, model, lambda line: line.sleep(5))
+def suspend(line: SimulatedBus) -> None:
+    line.sleep(5)  # as by Ctrl-Z
+
+
+def sleep_for_a_night(line: SimulatedBus) -> None:
+    line.slept += 8 * 3600  # CLOCK_MONOTONIC does not advance, so by that clock the start is not late
 
 
 @table("model", MAKE)
-def test_a_start_is_not_sent_if_the_computer_slept_during_checks(tmp_path: Path, model: str) -> None:
-    """CLOCK_MONOTONIC does not advance during sleep, so by that clock the start is not late."""
-
-    def sleep_for_a_night(line: SimulatedBus) -> None:
-        line.slept += 8 * 3600
-
-    check_not_sent(tmp_path, model, sleep_for_a_night)
+@pytest.mark.parametrize("hold_up", [suspend, sleep_for_a_night])
+def test_a_start_is_not_sent_after_a_suspension_or_sleep_during_checks(
+    tmp_path: Path, model: str, hold_up: Callable[[SimulatedBus], None]
+) -> None:
+    """The start is delayed at each of its reads."""
+    for frames in range(1, 100):
+        line, _, meanwhile, begun, failure = started_while(
+            tmp_path, model, frames, lambda line, drive: hold_up(line)
+        )
+        start = first(line, begun, STARTS[model])
+        if not meanwhile.has_come or (start is not None and start < frames):
+            break
+        assert start is None
+        assert isinstance(failure, Expired)
+    assert frames > 2
 
 
 def test_a_start_does_not_expire_because_of_slow_reads() -> None:
