@@ -359,13 +359,16 @@ def test_a_stalled_port_closes_in_time_if_no_descriptor_is_free(
     assert not port.is_open
 
 
-def test_port_loss_reason_is_known_before_reopening(terminal: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_loss_reason_and_another_masters_bytes_are_known_before_reopening(terminal: str) -> None:
     found = Line(terminal).open()
-    core = SimpleNamespace(lost=True, lost_error=0, called_off=True, is_stalled=False, stop=lambda: None)
+    core = SimpleNamespace(
+        lost=True, lost_error=0, called_off=True, is_stalled=False, foreign=7, stop=lambda: None
+    )
     found.queue = core  # type: ignore[assignment]
     found.drop()
     assert found.why_lost == f"{terminal}: the port was lost (hung up)"
     assert found._opened.must_discard
+    assert found.foreign == 7
     found.close()
 
 

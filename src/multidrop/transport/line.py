@@ -52,30 +52,23 @@ UNLOGGED = "; it is lost often, so further losses are not logged until a minute 
 
 
 class LineLog:
-    """The log of one line: reports losses of its port, but not too often; counts another master's bytes."""
+    """The log of one line: reports losses of its port, but not too often."""
 
     def __init__(self, port: str) -> None:
-        # number of another master's bytes, received while the line listened before a request
-        self.foreign = 0
         self.shows = _log.isEnabledFor  # returns whether a log level is enabled
         self._port = port
-        self._foreign_here = 0  # as `foreign`, but since the port was last opened
+        self._foreign = 0  # how many of another master's bytes are logged, since the port was last opened
         self._is_lost = self._is_stalled = self._miscounts = False
         self._why_unopened = ""
         self._losses = 0  # number of losses since `_losses_ns`
         self._losses_ns = 0
-        self.forked()
-
-    def forked(self) -> None:
-        """Replace the lock in a forked child, because a thread of the parent may hold it."""
-        self._noting = threading.Lock()
 
     def opened(self, identity: str) -> None:
         """Log that the port was opened; from now on, a loss of the port is logged again."""
         again = " again" if self._is_lost else ""
         if not self._is_lost or self._losses <= MOST_LOSSES or self._why_unopened:
             log_aside(_log, logging.INFO, "%s: opened%s (%s)", self._port, again, identity)
-        self._is_lost, self._is_stalled, self._foreign_here, self._why_unopened = False, False, 0, ""
+        self._is_lost, self._is_stalled, self._foreign, self._why_unopened = False, False, 0, ""
 
     def lost(self, why: str) -> None:
         """Log that the port was lost, unless this loss is already logged."""
@@ -119,12 +112,7 @@ class LineLog:
         log_aside(_log, logging.INFO, "%s: closed", self._port)
 
     def note_foreign(self, core: Port) -> None:
-        if core.foreign == self._foreign_here:
-            return
-        with self._noting:
-            now = core.foreign
-            came, self._foreign_here = now - self._foreign_here, now
-            self.foreign += came
+        came, self._foreign = core.foreign - self._foreign, core.foreign
         if came > 0:
             log_aside(_log, logging.WARNING, FOREIGN, self._port, came)
 
@@ -180,6 +168,7 @@ class Line:
         self.queue: Port | None = None
         self._tap: Tap | None = None
         self._log = LineLog(port)
+        self._foreign = 0  # as the property `foreign`, but only on earlier openings of the port
         self._is_over = False
         self._why_closed = "it is closed"
         self._why_lost: str | None = None
@@ -198,7 +187,6 @@ class Line:
     def forked(self) -> None:
         """Close the line in a forked child: a descriptor that stays open there would keep the port busy."""
         self._make_locks()
-        self._log.forked()
         self._is_over = True
         self._why_closed = "it was opened before this process was forked; open it again here"
         self.queue = None
@@ -253,6 +241,7 @@ class Line:
                 self._why_lost = f"the port was lost ({(why := why_lost(self.port, core.lost_error))})"
                 self._log.lost(why)
             core.stop()
+            self._foreign += core.foreign
             self._opened.must_discard |= bool(core.called_off)
 
     def drop_lost(self) -> None:
@@ -460,7 +449,8 @@ class Line:
     @property
     def foreign(self) -> int:
         """Number of another master's bytes, received while the line listened before a request."""
-        return self._log.foreign
+        core = self.queue
+        return self._foreign + (core.foreign if core else 0)
 
     @property
     def has_echo(self) -> bool:
