@@ -484,22 +484,23 @@ def declaration(declare: Callable[..., Register[Any]]) -> Declaration:
 @declaration
 def reading(address: int, what: str | type = "", /, **details: Unpack[Details]) -> Register[Any]:
     """Declare a quantity that can only be read, with its unit or the enumeration of its values."""
-    return _declare(Access.READING, address, what, details)
+    return declare(Access.READING, address, what, details)
 
 
 @declaration
 def setting(address: int, what: str | type = "", /, **details: Unpack[Details]) -> Register[Any]:
     """Declare a quantity that can be read and written, with its unit or the enumeration of its values."""
-    return _declare(Access.SETTING, address, what, details)
+    return declare(Access.SETTING, address, what, details)
 
 
 @declaration
 def command(address: int, what: str | type = "", /, **details: Unpack[Details]) -> Register[Any]:
     """Declare a quantity that can only be written, with its unit or the enumeration of its values."""
-    return _declare(Access.COMMAND, address, what, details)
+    return declare(Access.COMMAND, address, what, details)
 
 
-def _declare(access: Access, address: int, what: Any, given: Details) -> Register[Any]:
+def declare(access: Access, address: int, what: Any, given: Details) -> Register[Any]:
+    """Declare a register; `what` is its unit, or the enumeration of its values."""
     details = cast(Any, given)
     if isinstance(details.get("invalid"), (int, float)):
         details = {**details, "invalid": (details["invalid"],)}

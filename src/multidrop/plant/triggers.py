@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 from multidrop.channels import Channel, ChannelSet
 from multidrop.channels.grammar import ExpressionError, ReferenceStep, parse
+from multidrop.drive.known_state import FAULT
 from multidrop.plant.model import Plant, PolledDrive, series_of
 
 PRE_S, POST_S = 5.0, 10.0  # default seconds recorded before and after a trigger
-FAULT = "fault"  # the condition for a fault of any drive, and the name of the register with the fault
 
 TriggerSeries = tuple[str, str]  # drive, and name of a register or channel
 

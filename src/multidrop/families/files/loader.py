@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,7 @@ from multidrop.families.files.registers import (
 from multidrop.families.files.sections import (
     FAMILY_KEYS,
     facts_of,
-    identify_by,
+    identify,
     options_of,
     parameter_space_of,
     proofs_of,
@@ -49,15 +48,8 @@ MOST_MISTAKES = 200
 MOST_CSV_FILES = 20
 
 
-@dataclass(frozen=True)
-class _Loaded:
-    """A loaded family and the contents of its files, which show whether the files have changed."""
-
-    files: Mapping[Path, bytes]
-    family: type[Drive]
-
-
-_loaded: dict[Path, _Loaded] = {}
+# loaded families by path, each with the contents of its files, which show whether the files have changed
+_loaded: dict[Path, tuple[Mapping[Path, bytes], type[Drive]]] = {}
 
 
 def load_family(path: Path | str) -> type[Drive]:
@@ -69,20 +61,21 @@ def load_family(path: Path | str) -> type[Drive]:
     path = Path(path)
     place = TomlPlace.in_file(path)
     whole = path.resolve()
-    known = _loaded.get(whole)
-    if known is not None and all(_same(file, data) for file, data in known.files.items()):
-        return known.family
+    if whole in _loaded:
+        known, family = _loaded[whole]
+        if all(_same(file, data) for file, data in known.items()):
+            return family
     files: dict[Path, bytes] = {}
     data = place.attempt(_bytes, path, "family's file")
     document = None if data is None else place.attempt(parse_document, data)
     if data is None or document is None:
         raise FamilyError(tuple(place.config_errors))
     files[whole] = data
-    family = _family(document, path, place, files)
-    if family is None:
+    made = _family(document, path, place, files)
+    if made is None:
         raise FamilyError(_at_most(place))
-    _loaded[whole] = _Loaded(files, family)
-    return family
+    _loaded[whole] = files, made
+    return made
 
 
 def _same(file: Path, data: bytes) -> bool:
@@ -162,10 +155,9 @@ def _family(
         rule = parameter_space_of(document["parameters"], counting, declared.places, place)
         namespace["parameter_space"] = rule
     if "identify" in document:
-        proofs = proofs_of(document["identify"], declared.registers, place)
-        namespace["identity_proofs"] = proofs
+        namespace["identity_proofs"] = proofs_of(document["identify"], declared.registers, place)
         if base.identify is Drive.identify:
-            namespace["identify"] = identify_by(proofs)
+            namespace["identify"] = identify
     return _made(base, namespace, declared, place)
 
 

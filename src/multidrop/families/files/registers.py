@@ -25,9 +25,7 @@ from multidrop.drive.register import (
     Carrier,
     Kept,
     Register,
-    command,
-    reading,
-    setting,
+    declare,
 )
 from multidrop.families.files import notation
 from multidrop.families.files.notation import TABLES, Counting
@@ -327,12 +325,6 @@ def shown(value: Any) -> str:
 
 
 MOST_REGISTERS = 2000
-SECTIONS = tuple(access.value for access in Access)
-_DECLARE: Mapping[Access, Callable[..., Register[Any]]] = {
-    Access.READING: reading,
-    Access.SETTING: setting,
-    Access.COMMAND: command,
-}
 # keys of the section [default] that do not apply to coils and discrete inputs
 _WITHOUT_BITS = ("number_format", "order", "invalid", "step", "unit")
 
@@ -380,7 +372,7 @@ class Declared:
             details["ram_address"] = good["ram_address"]
         if "title" in good:
             details["titles"] = good["title"]
-        register = place.attempt(partial(_DECLARE[access], address[0], what, table=table, **details))
+        register = place.attempt(declare, access, address[0], what, {"table": table, **details})
         if register is not None:
             register.__set_name__(type(self), name)
             self.registers[name] = register

@@ -5,7 +5,7 @@ These are [family], [option], [text], [parameters] and [[identify]].
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from math import inf
 from typing import Any
@@ -18,7 +18,7 @@ from multidrop.drive.parameters import ParameterGroup, ParameterSpace
 from multidrop.drive.register import Option, Register, Table
 from multidrop.drive.request import LONGEST_INTERVAL, STANDARD_LIMITS
 from multidrop.drive.text import Text, text
-from multidrop.drive.verbs import Script, Verb, read, verb
+from multidrop.drive.verbs import Script, read, verb
 from multidrop.errors import WriteForbidden
 from multidrop.families.files.notation import TABLES, Counting
 from multidrop.families.files.registers import ADDRESS, BESIDE, FINITE, WRITES, converted, shown, unusable
@@ -524,19 +524,14 @@ def _proves_nothing(proof: Proof, register: Register[Any]) -> str:
     return "" if proof.values or proof.above >= least or proof.below <= most else "every value is accepted"
 
 
-def identify_by(proofs: Sequence[Proof]) -> Verb[[], None]:
-    """Return a method `identify` that checks the registers in [[identify]]."""
-
-    @verb
-    def identify(self: Drive) -> Script[None]:
-        """Read the registers in [[identify]]. Raises WriteForbidden if one has another value."""
-        for proof in proofs:
-            register = self.register(proof.register)
-            value = yield from read(register)
-            if not proof.holds(value):
-                shown = f"{register.name} = {register.format(value)}"
-                raise WriteForbidden(
-                    f"{self.name} shows {shown}, so it is not a {self.title or type(self).__name__}"
-                )
-
-    return identify
+@verb
+def identify(self: Drive) -> Script[None]:
+    """Read the registers in [[identify]]. Raises WriteForbidden if one has another value."""
+    for proof in self.identity_proofs:
+        register = self.register(proof.register)
+        value = yield from read(register)
+        if not proof.holds(value):
+            shown = f"{register.name} = {register.format(value)}"
+            raise WriteForbidden(
+                f"{self.name} shows {shown}, so it is not a {self.title or type(self).__name__}"
+            )
