@@ -5,15 +5,15 @@ A sweep sends one request to many addresses at one setting.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
-from weakref import WeakKeyDictionary
 
 from multidrop.core import MODBUS, Framing, Message, build_request
 from multidrop.drive.family import Drive
 from multidrop.drive.line_settings import Settings
-from multidrop.drive.register import Access, Carrier, Register, Table
+from multidrop.drive.register import Access, Carrier, Register
+from multidrop.drive.request import readable_addresses
 from multidrop.planning.blocks import Block
 from multidrop.planning.bus_time import silence
 from multidrop.transport.drive_records import LEAST_TIMEOUT
@@ -191,29 +191,15 @@ def _best(families: Collection[type[Drive]]) -> Register[Any] | None:
     )
 
 
-_known: WeakKeyDictionary[type[Drive], Mapping[Table, Collection[int]]] = WeakKeyDictionary()
-
-
-def _addresses(family: type[Drive]) -> Mapping[Table, Collection[int]]:
-    """Return the family's readable addresses by table (cached)."""
-    if family not in _known:
-        found: dict[Table, set[int]] = {}
-        for register in family.registers.values():
-            if register.readable:
-                found.setdefault(register.table, set()).add(register.address)
-        _known[family] = found
-    return _known[family]
-
-
 def _has(family: type[Drive], register: Register[Any]) -> bool:
-    return register.address in _addresses(family).get(register.table, ())
+    return register.address in readable_addresses(family, register.table)
 
 
 def _answers(family: type[Drive], register: Register[Any]) -> bool:
     """Return True if drives of the family answer a read of this register, even if only by an exception."""
     if _has(family, register):
         return True
-    reads = register.table in _addresses(family)
+    reads = bool(readable_addresses(family, register.table))
     return reads and family.exceptions is not Drive.exceptions and _ILLEGAL_ADDRESS in family.exceptions
 
 

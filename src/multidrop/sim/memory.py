@@ -10,7 +10,6 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import cache
 from typing import Any
 
 from multidrop.core import Framing
@@ -183,7 +182,6 @@ class Memory:
         return [self._cell(register.table, register.address + at) for at in range(register.words)]
 
 
-@cache
 def _space(table: Table) -> object:
     return table if table.read is None else table.read_space
 
