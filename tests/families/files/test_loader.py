@@ -310,6 +310,19 @@ WRONG_KEYS = [  # each text has one wrong key of a register
     ("title.ru = ''", "has a title of 0 characters, not 1 to 100"),
     ("bits = { real = 0 }", "'real' is a name that all enumerations"),
     ("bits = { On = 0, on = 1 }", "on and On differ in capitals alone"),
+    ("unit = 5", "unit = 5: the value is not a text; write unit = "),
+    ('unit = "a\\tb"', "the value has unprintable characters; remove them"),
+    (f"note = '{1001 * 'x'}'", "the value has more than 1000 characters"),
+    ("offset = 'x'", "offset = 'x': the value is not a number; write offset = -40"),
+    ("span = 5", "span = 5: the value is not two numbers; write span = [0, 50]"),
+    ("harmless = 0", "harmless = 0: the value is not a list of raw counts"),
+    (f"harmless = {101 * [0]}", "the value has more than 100 raw counts"),
+    ("invalid = []", "invalid = []: the value is not a list of 1 to 100 raw counts"),
+    ("part = 1.5", "part = 1.5: the value is not a bit's number or a range of bits"),
+    ("part = '7-4'", "part = '7-4': the value is in the wrong order: give the lowest bit first"),
+    ("values = 5", "values = 5: the value must be a table of names and numbers"),
+    ("values = { 1a = 0 }", "values: '1a' is not a name: it may have letters a to z"),
+    (f"values = {{ {', '.join(f'v{n} = {n}' for n in range(501))} }}", "values has 501 names, more than"),
 ]
 WRONG_SECTIONS = [  # each text is a wrong section before a valid section [reading]
     ("[option]\nx = { span = [2, 1], meaning = 'm' }", "span = [2, 1]"),
@@ -323,6 +336,21 @@ WRONG_SECTIONS = [  # each text is a wrong section before a valid section [readi
     ("framings = ['tcp']", "'tcp' is not one of rtu, ascii"),
     ("framings = ['delixi']", "'delixi' is not one of rtu, ascii"),
     ("exceptions = { 300 = 'x' }", "300 = 'x' is not an exception code from 1 to 255"),
+    ("exceptions = { 8g = 'x' }", "'8g' is not an exception code"),
+    ("write = 'both'", "write = 'both' is not right; write write = \"single\""),
+    ("formats = [5]", "formats = [5]: 5 is not a format"),
+    ("formats = { rtu = 5 }", "formats = {'rtu': 5}: 5 is not a list of formats"),
+    ("formats = { rtu = ['8N1'], tcp = ['8N1'] }", "formats has 'tcp', which is not one of the framings rtu"),
+    ("framings = ['rtu', 'ascii']\nformats = { rtu = ['8N1'] }", "formats has no list for ascii; add ascii"),
+    ("read_together = [5]", "read_together = [5]: 5 is not a list of registers' names"),
+    ("gaps = { inputs = [1, 2] }", "gaps has 'inputs', which is not a register table; write holding, input"),
+    ("gaps = { input = 5 }", "gaps: input = 5 is not a list of a first and a last address"),
+    ("gaps = { input = ['x', 2] }", 'gaps: input: "x" is not an address'),
+    ("profile = 'delta'\nextends = 'yd1000'", "has the keys profile and extends; remove one of them"),
+    (f"registers = {[f'{n}.csv' for n in range(21)]}", "registers names 21 files, more than the allowed 20"),
+    ("[default]\nstep = 0", "[default]: step = 0: every reading would be 0"),
+    ("[option]\na = { span = [1, 2], meaning = 'm' }", "[option] a: a register has the same name"),
+    (21 * "[[identify]]\nregister = 'a'\nis = [1]\n", "[[identify]] has 21 tables, more than the allowed 20"),
 ]
 WRONG_TEXTS = [  # each text has a mistake, and follows the valid text HEAD
     ("", "t.toml: declares no register; add [reading] and NAME = { at = 0x0010 }"),
@@ -354,6 +382,11 @@ WRONG_TEXTS = [  # each text has a mistake, and follows the valid text HEAD
     ),
     ("registers = ['x.csv']\n", 'registers = ["x.csv"]: there is no such file'),
     ("option = 3\n", "declares no register"),
+    (f"[reading]\n{61 * 'a'} = {{ at = 1 }}\n", "it has more than 60 characters; give it a shorter one"),
+    (
+        "[reading]\n" + "".join(f"a{n} = {{ at = {n} }}\n" for n in range(2001)),
+        "declares more than 2000 registers; remove unused ones",
+    ),
 ]
 WRONG_FILES = [  # each text is a whole family file with a mistake
     ("", "t.toml: has no [family]; add it, with the title and the manual"),
@@ -364,6 +397,10 @@ WRONG_FILES = [  # each text is a whole family file with a mistake
     ),
     ("family = 3\n", "[family]: 3 is not a table with title"),
     ("family = 3\nreading = 4\n", "[reading] is not a table"),
+    ("default = 5\n" + HEAD, "[default]: is not a table; write [default] and table ="),
+    ("option = 5\n" + HEAD, "[option] is not a table; write [option] and NAME ="),
+    ("text = 5\n" + HEAD, "[text] is not a table; write [text] and NAME ="),
+    (HEAD.replace("= 0", "= 2"), "counts_from = 2 is not right; write counts_from = 0, or 1"),
 ]
 
 
@@ -411,6 +448,16 @@ def test_mistake_in_a_family_file_is_reported_with_its_line(tmp_path: Path, text
         (b"\xff\xfen\0a\0", "c.csv: is not text in UTF-8, from byte 0 on"),
         (b"name,at\na,1\na,2\n", "line 3, a: a is declared twice, first in line 2, a"),
         (b"name,at\n\na b,1\n", "c.csv: line 3, a b: 'a b' cannot be a register's name"),
+        (b"name,at,,\n,1,,\n", "c.csv: line 2, column name: the register's name is missing"),
+        (b"name,at\na\0,1\n", "c.csv: contains NUL bytes; save it as CSV UTF-8"),
+        (
+            b"name,at,harmless\na,1,1234567890123456789012\n",
+            "column harmless: '1234567890123456789012' has too many digits",
+        ),
+        (
+            b"name,at\n" + b"".join(b"a%d,%d\n" % (n, n) for n in range(2001)),
+            "c.csv: has more than 2000 registers; remove unused ones",
+        ),
     ],
 )
 def test_mistake_in_a_csv_table_is_reported_with_its_line(tmp_path: Path, data: bytes, expected: str) -> None:
@@ -489,6 +536,12 @@ def test_family_file_can_declare_text_registers(tmp_path: Path) -> None:
         (
             "name = { at = 1, length = 2 }",
             "[text] name: reserved name: every drive has an attribute",
+        ),
+        ("1a = { at = 1, length = 2 }", "[text] 1a: '1a' cannot be a text's name: it may have letters"),
+        ("a = { at = '8192', length = 2 }", '[text] a: "8192" may be decimal or hex'),
+        (
+            "".join(f"a{n} = {{ at = 1, length = 2 }}\n" for n in range(101)),
+            "[text] has 101 texts, more than",
         ),
     ],
 )
