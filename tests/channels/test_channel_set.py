@@ -260,6 +260,14 @@ def test_an_invalid_name_of_a_computed_channel_is_reported(name: str, sentence: 
     assert not made
 
 
+def test_the_number_of_computed_channels_is_limited() -> None:
+    many = [Channel(f"c{number}", "power", "kW") for number in range(1001)]
+    made = ChannelSet([DriveSeries("pump", {"power": ("kW", 1.0)}, {"power"}, many)])
+    assert [str(mistake) for mistake in made.mistakes] == [
+        'drive "pump", channel "c1000": a plant has at most 1000 channels'
+    ]
+
+
 def awake(one: SlotRow, slept_s: float) -> SlotRow:
     """Return a row from after a sleep of the computer, in which the monotonic clock stood still."""
     return one._replace(time_ns=one.time_ns + round(slept_s * S))

@@ -133,6 +133,9 @@ MISTAKES = {
     'table(current, "V", 1, 2, status, 4)': "column 27: the points of a table must be numbers",
     'table(current, "V", 1, 2)': 'column 1: a table has two or more points: table(x, "unit", x1, y1, x2, y2)',
     "as(current)": 'column 1: as() takes a value and a unit: as(x, "kW")',
+    f'as(current, "{"*".join(17 * ["km3"])}")': "column 1: the unit km*km*",
+    '"A"': "column 1: a number is needed here, not a text",
+    f"min({130 * '1,'}1)": "column 265: the call has more than 130 arguments",
     "1e999 * current": "column 1: the number 1e999 is too large",
     "(" * 60 + "current" + ")" * 60: "column 41: the expression has more than 40 nested levels; split it",
     "current"

@@ -75,6 +75,13 @@ WRONG: list[tuple[type[Drive], dict[str, Any], str]] = [
     (VfdEl, {"reference_in_force": reading(9, "%", step=0.01)}, "reference_in_force: its unit is not"),
     (Atv320, {"control": command(1, IntFlag("Bits", {"reverse": 8}))}, "control: bit 3 is ENABLE_OPERATION"),
     (Atv320, {"control": command(1, IntFlag("Bits", {"jog": 256}))}, "control: bits may only add reverse"),
+    (
+        Atv320,
+        {"control": command(1, IntEnum("Bits", {"reverse": 0x1800}))},
+        "control: reverse is not one bit",
+    ),
+    (Acs355, {"status": reading(3, part=(0, 7))}, "status: it is a whole word, so it cannot have part"),
+    (VfdEl, {"control": command(0x2000, broadcast=(0x12,))}, "control: broadcast has counts that are not"),
 ]
 
 

@@ -310,9 +310,6 @@ class Inovance(Invt):
     def _tripped(self, status: int) -> Script[bool]:
         return bool((yield from read(self.register("fault"))) != 0)
 
-    def _is_tripped(self, status: int) -> bool:
-        return False  # the status register has no value for a fault
-
     def _turns(self, status: int) -> bool:
         return status != InovanceStatus.STOPPED
 
