@@ -191,11 +191,11 @@ def _best(families: Collection[type[Drive]]) -> Register[Any] | None:
     )
 
 
-def _has(family: type[Drive], register: Register[Any]) -> bool:
+def _has(family: Any, register: Register[Any]) -> bool:
     return register.address in readable_addresses(family, register.table)
 
 
-def _answers(family: type[Drive], register: Register[Any]) -> bool:
+def _answers(family: Any, register: Register[Any]) -> bool:
     """Return True if drives of the family answer a read of this register, even if only by an exception."""
     if _has(family, register):
         return True
