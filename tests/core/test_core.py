@@ -578,7 +578,7 @@ def test_write_permit_is_invalid_if_the_call_began_before_a_stop() -> None:
     assert latch.permit().is_good
 
 
-def test_closing_a_port_reports_whether_each_pending_request_was_sent(drive: Drive) -> None:
+def test_closing_a_port_wakes_its_threads_and_reports_what_was_sent(drive: Drive) -> None:
     """A request that was still waiting when its port was closed is never sent."""
     came = threading.Event()
 
@@ -815,23 +815,6 @@ def test_port_is_lost_if_the_descriptor_has_no_serial_settings(drive: Drive) -> 
 def test_an_invalid_descriptor_raises() -> None:
     with pytest.raises(OSError, match="the core cannot watch the port"):
         Port(-1, NO_SETTINGS)
-
-
-def test_closing_a_port_wakes_the_threads_that_wait_for_replies(drive: Drive) -> None:
-    requested = threading.Event()
-
-    def answer(_: Message) -> bytes:
-        requested.set()
-        return b""
-
-    port = Port(drive(answer), NO_SETTINGS)
-    found: list[int] = []
-    waiting = threading.Thread(target=lambda: found.append(port.carry_out(read(0, timeout=60)).result))
-    waiting.start()
-    requested.wait()
-    port.close()
-    waiting.join()
-    assert found == [Failure.LINE_LOST]
 
 
 def test_is_asking_is_true_while_the_drive_has_pending_exchanges() -> None:
