@@ -12,7 +12,6 @@ from multidrop.core.capture import Tap as Tap
 from multidrop.core.capture import Unpacked as Unpacked
 from multidrop.core.capture import Unpacker as Unpacker
 from multidrop.core.capture import Wrappings as Wrappings
-from multidrop.core.columns import COLUMNS as COLUMNS
 from multidrop.core.columns import LOW_BYTE_FIRST as LOW_BYTE_FIRST
 from multidrop.core.columns import LOW_WORD_FIRST as LOW_WORD_FIRST
 from multidrop.core.columns import MOST_INVALID as MOST_INVALID
@@ -37,7 +36,6 @@ from multidrop.core.exchange import Peer as Peer
 from multidrop.core.exchange import Status as Status
 from multidrop.core.exchange import delay_edge as delay_edge
 from multidrop.core.frame import MODBUS as MODBUS
-from multidrop.core.frame import CharacterFormat as CharacterFormat
 from multidrop.core.frame import FrameFault as FrameFault
 from multidrop.core.frame import Framing as Framing
 from multidrop.core.frame import Message as Message

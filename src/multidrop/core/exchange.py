@@ -164,9 +164,9 @@ class Completion:
 
     __slots__ = ("c", "count", "numbers", "room", "values")
 
-    def __init__(self, found: Any = None, count: int = -1, *, room: int = 0) -> None:
+    def __init__(self, found: Any = None, *, room: int = 0) -> None:
         self.c = ffi.new(_COMPLETION) if found is None else found
-        self.count = count
+        self.count = -1
         self.room = room
         self.values = ffi.new(_VALUES, room)
         self.numbers = memoryview(ffi.buffer(self.values)).cast("d") if room else _NO_NUMBERS
