@@ -5,15 +5,21 @@ from __future__ import annotations
 from collections import defaultdict, deque
 from collections.abc import Mapping
 from contextlib import suppress
+from itertools import groupby
 from pathlib import Path
 from typing import NamedTuple
 
-from multidrop.capture.decoding import Pairing, RegisterLookup, Sniffed, SniffedExchange, data_of, line_of
+from multidrop.capture.decoding import Decoding
 from multidrop.capture.pcapng import Capture
-from multidrop.core import Message, Splitter
+from multidrop.core import Message, Status
 from multidrop.drive.family import Drive
 from multidrop.plant.model import Plant
 from multidrop.sim import SimulatedDrive
+
+# statuses of rows that state what a register holds
+ANSWERED = {str(Status.OK), str(Status.NO_VALUE)}
+# statuses of rows without a valid reply; exception replies have other statuses
+SILENT = {str(status) for status in Status} - ANSWERED
 
 
 class CapturedReply(NamedTuple):
@@ -33,43 +39,20 @@ class Replay:
     def __init__(self, path: Path | str, plant: Plant) -> None:
         self.start: float | None = None  # time of the first request to a replayed drive
         self._replies: dict[str, list[CapturedReply]] = defaultdict(list)
-        lookups: list[RegisterLookup] = []
-        pairings: list[tuple[Splitter, Pairing]] = []
-        found: list[tuple[RegisterLookup, Sniffed]] = []
         with Capture(path) as capture:
-            for _ in capture:
-                for name in capture.lines[len(lookups) :]:
-                    lookups.append(RegisterLookup(line_of(plant, name)))
-                    pairings.append((Splitter(), Pairing()))
-                for lookup, (splitter, pairing), stream in zip(
-                    lookups, pairings, capture.streams, strict=True
-                ):
-                    found += [(lookup, one) for one in pairing.pair(splitter.spans(stream))]
-        for lookup, (_, pairing) in zip(lookups, pairings, strict=True):
-            found += [(lookup, one) for one in pairing.flush()]
-        found.sort(key=lambda one: one[1].time_ns)
-        for lookup, sniffed in found:
-            if isinstance(sniffed, SniffedExchange) and sniffed.request and not sniffed.is_broadcast:
-                after_s = (sniffed.time_ns - found[0][1].time_ns) / 1e9
-                self._note(lookup, sniffed, sniffed.request, after_s)
+            rows = sorted(
+                (row for batch in Decoding(capture, plant) for row in batch),
+                key=lambda row: (row.time_ns, row.drive),
+            )
+        for (time_ns, drive), exchange in groupby(rows, key=lambda row: (row.time_ns, row.drive)):
+            found = list(exchange)
+            values = {row.register: row.value for row in found if row.status in ANSWERED}
+            is_silent = found[0].status in SILENT
+            reply = CapturedReply((time_ns - rows[0].time_ns) / 1e9, None if is_silent else values)
+            self._replies[drive].append(reply)
         names = {polled.drive.name for polled in plant.drives}
         if not self._replies.keys() & names:
             raise ValueError(f"the capture {path} has no exchange with {', '.join(sorted(names))}")
-
-    def _note(
-        self, lookup: RegisterLookup, exchange: SniffedExchange, request: Message, after_s: float
-    ) -> None:
-        target = lookup.find(exchange.framing, request)
-        if exchange.reply is None:
-            self._replies[target.drive].append(CapturedReply(after_s, None))
-            return
-        data = b"" if exchange.reply.exception else data_of(exchange, request)
-        values = {
-            place.name: place.register.number_in(data, place.at)
-            for place in target.places
-            if place.register is not None and data
-        }
-        self._replies[target.drive].append(CapturedReply(after_s, values))
 
     def drive(self, drive: Drive) -> ReplayedDrive:
         """Return a simulation of this drive with the values captured from the drive of the same name."""
