@@ -444,9 +444,9 @@ async def test_an_export_of_a_history_starts_outside_the_event_loop(tmp_path: Pa
     readers: list[int] = []
 
     class Noted(History):
-        def unit_history_of(self, *of: Any) -> Any:
+        def read(self, *of: Any) -> Any:
             readers.append(threading.get_ident())
-            return super().unit_history_of(*of)
+            return super().read(*of)
 
     async with historian_in(tmp_path) as part:
         part.history = Noted(part.history.folder)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 from multidrop.history.buckets import Buckets, Grid, UnitBuckets, grid_of
@@ -18,7 +18,6 @@ from multidrop.history.sources import (
     Replaced,
     Sources,
     gather_files,
-    metadata_of,
     rows_of_file,
     units_in_rows,
     write_parquet,
@@ -26,6 +25,7 @@ from multidrop.history.sources import (
 from multidrop.history.units import (
     Moment,
     OtherColumn,
+    Query,
     Series,
     UnitHistory,
     ns_of,
@@ -76,16 +76,7 @@ class History:
 
     def metadata(self) -> Metadata:
         """Return the metadata of the newest segment; {} without segments."""
-        return self._sources.again(self._newest_metadata)
-
-    def _newest_metadata(self, found: Listing) -> Metadata:
-        number = max([*found.segments, *found.rows], default=0)
-        if number in found.rows:
-            return metadata_of(self._sources, found.rows[number])
-        if number in found.segments:
-            with self._sources.segment(number, found, *ALWAYS) as segment:
-                return segment.metadata if segment else {}
-        return {}
+        return self._sources.metadata()
 
     # ---- rows ----
 
@@ -104,68 +95,8 @@ class History:
         batches of rows, Arrow.
         """
         first = ALWAYS[0] if begin is None else ns_of(begin)
-        return HistoryRows(self, parsed_series(series), first, ALWAYS[1] if end is None else ns_of(end))
-
-    def unit_history_of(self, series: Sequence[Series] | None, begin: int, end: int) -> UnitHistory:
-        """Return the newest and the earlier units of the series (None: all series) in this range."""
-        units = UnitHistory({}, series)
-        self._sources.again(lambda found: self._learnt(found, series, begin, end, units))
-        return units
-
-    def rows_of(
-        self, series: Sequence[Series] | None, begin: int, end: int, units: UnitHistory
-    ) -> Iterator[Rows]:
-        """Yield the rows that `read` returns, for parsed series and times in ns."""
-        found = self._sources.again(lambda found: self._learnt(found, series, begin, end, units))
-        given = 0  # number of the newest segment whose rows were yielded
-        for number in sorted({*found.segments, *found.rows}):
-            if number <= given:
-                continue
-            for _ in range(MOST_TRIES):
-                try:
-                    yield from self._rows_of_segment(number, found, series, begin, end, units)
-                    break
-                except Replaced:  # no row was yielded yet, so the segment can be read from its new file
-                    found = self._sources.listing()
-                    self._check_merged(number, found)
-            else:
-                raise self._sources.too_often()
-            given = found.rows[number].last if number in found.rows else number
-
-    def _check_merged(self, number: int, found: Listing) -> None:
-        """Raise OSError if this segment was merged with segments whose rows were already yielded."""
-        if any(file.first < number <= file.last for file in found.rows.values()):
-            raise OSError(f"{self.folder}: files were merged during this read: read the history again")
-
-    def _learnt(
-        self, found: Listing, series: Sequence[Series] | None, begin: int, end: int, units: UnitHistory
-    ) -> Listing:
-        """Add to `units` the units of all listed segments, and return the listing."""
-        known = self._sources.known(found, begin, end)
-        new = units.unknown_of(known)
-        if files := [found.rows[number] for number in new if number in found.rows and not known[number]]:
-            known |= units_in_rows(self._sources, files, series, begin, end)
-        units.learn(known)
-        return found
-
-    def _rows_of_segment(
-        self,
-        number: int,
-        found: Listing,
-        series: Sequence[Series] | None,
-        begin: int,
-        end: int,
-        units: UnitHistory,
-    ) -> Iterator[Rows]:
-        file, others = found.rows.get(number), units.other_columns(number)
-        if file and file.may_have(begin, end):
-            yield from rows_of_file(self._sources, file, series, begin, end, others)
-        elif number in found.segments:
-            wanted = None if series is None else frozenset(series)
-            with self._sources.segment(number, found, begin, end) as segment:
-                for batch in segment.batches(begin, end) if segment else ():
-                    if segment and (rows := segment.rows_of(batch, wanted, begin, end)):
-                        yield from_rows(_renamed(rows, others))
+        last = ALWAYS[1] if end is None else ns_of(end)
+        return HistoryRows(self._sources, Query(parsed_series(series), first, last))
 
     # ---- buckets ----
 
@@ -248,7 +179,7 @@ class History:
         rows, target = self.read(series, begin, end), Path(path)
         if target.suffix.lower() == ".parquet":
             try:
-                return self._export_parquet(rows, target)
+                return rows.write_parquet(target)
             except MissingDuckDB:
                 pass
         writer = open_writer(target, rows.metadata)
@@ -261,44 +192,81 @@ class History:
             raise
         return writer.rows
 
-    def _export_parquet(self, rows: HistoryRows, target: Path) -> int:
-        def write(found: Listing) -> int:
-            files = [file for file in found.rows.values() if file.may_have(rows.begin, rows.end)]
-            batches = (
-                batch
-                for number in sorted(found.segments)
-                for batch in self._rows_of_segment(
-                    number, found, rows.series, rows.begin, rows.end, rows.units
-                )
-            )
-            self._learnt(found, rows.series, rows.begin, rows.end, rows.units)
-            others = {file.first: rows.units.other_columns(file.first) for file in files}
-            of = rows.series, (rows.begin, rows.end), rows.metadata, others
-            return write_parquet(self._sources, target, batches, files, *of)
-
-        self._sources.cursor().close()  # raises MissingDuckDB before a file is created
-        new_file(target).close()
-        try:
-            return self._sources.again(write)
-        except BaseException:
-            target.unlink(missing_ok=True)
-            raise
-
 
 class HistoryRows(RecordingReader):
     """Rows of a history; every iteration reads the files again."""
 
     truncated = 0
 
-    def __init__(self, history: History, series: Sequence[Series] | None, begin: int, end: int) -> None:
-        super().__init__(history.folder)
-        self._history = history
-        self.series, self.begin, self.end = series, begin, end
-        self.units = history.unit_history_of(series, begin, end)
-        self.metadata = self.units.described(history.metadata())
+    def __init__(self, sources: Sources, query: Query) -> None:
+        super().__init__(sources.folder)
+        self._sources, self._query = sources, query
+        self._units = UnitHistory({}, query.series)
+        sources.again(self._learnt)
+        self.metadata = self._units.described(sources.metadata())
 
     def __iter__(self) -> Iterator[Rows]:
-        return self._history.rows_of(self.series, self.begin, self.end, self.units)
+        sources = self._sources
+        found = sources.again(self._learnt)
+        given = 0  # number of the newest segment whose rows were yielded
+        for number in sorted({*found.segments, *found.rows}):
+            if number <= given:
+                continue
+            for _ in range(MOST_TRIES):
+                try:
+                    yield from self._rows_of_segment(number, found)
+                    break
+                except Replaced:  # no row was yielded yet, so the segment can be read from its new file
+                    found = sources.listing()
+                    self._check_merged(number, found)
+            else:
+                raise sources.too_often()
+            given = found.rows[number].last if number in found.rows else number
+
+    def _check_merged(self, number: int, found: Listing) -> None:
+        """Raise OSError if this segment was merged with segments whose rows were already yielded."""
+        if any(file.first < number <= file.last for file in found.rows.values()):
+            raise OSError(f"{self.path}: files were merged during this read: read the history again")
+
+    def _learnt(self, found: Listing) -> Listing:
+        """Learn the units of all listed segments, and return the listing."""
+        known = self._sources.known(found, self._query.begin, self._query.end)
+        new = self._units.unknown_of(known)
+        if files := [found.rows[number] for number in new if number in found.rows and not known[number]]:
+            known |= units_in_rows(self._sources, files, self._query)
+        self._units.learn(known)
+        return found
+
+    def _rows_of_segment(self, number: int, found: Listing) -> Iterator[Rows]:
+        query, file, others = self._query, found.rows.get(number), self._units.other_columns(number)
+        if file and file.may_have(query.begin, query.end):
+            yield from rows_of_file(self._sources, file, query, others)
+        elif number in found.segments:
+            wanted = None if query.series is None else frozenset(query.series)
+            with self._sources.segment(number, found, query.begin, query.end) as segment:
+                for batch in segment.batches(query.begin, query.end) if segment else ():
+                    if segment and (rows := segment.rows_of(batch, wanted, query.begin, query.end)):
+                        yield from_rows(_renamed(rows, others))
+
+    def write_parquet(self, target: Path) -> int:
+        """Write the rows into a new Parquet file with duckdb; return their number. Raises MissingDuckDB."""
+        self._sources.cursor().close()  # raises MissingDuckDB before a file is created
+        new_file(target).close()
+        try:
+            return self._sources.again(lambda found: self._copy_to(target, found))
+        except BaseException:
+            target.unlink(missing_ok=True)
+            raise
+
+    def _copy_to(self, target: Path, found: Listing) -> int:
+        query = self._query
+        files = [file for file in found.rows.values() if file.may_have(query.begin, query.end)]
+        batches = (
+            batch for number in sorted(found.segments) for batch in self._rows_of_segment(number, found)
+        )
+        self._learnt(found)
+        others = {file.first: self._units.other_columns(file.first) for file in files}
+        return write_parquet(self._sources, target, batches, files, query, self.metadata, others)
 
 
 def _renamed(rows: list[Row], others: Iterable[OtherColumn]) -> list[Row]:

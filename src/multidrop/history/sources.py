@@ -24,7 +24,7 @@ from multidrop.history.database import (
 )
 from multidrop.history.folder import HistoryFile, Listing, listing
 from multidrop.history.growing import GrowingSegment
-from multidrop.history.units import FileUnits, OtherColumn, Series, SeriesUnit, file_units_of
+from multidrop.history.units import FileUnits, OtherColumn, Query, Series, SeriesUnit, file_units_of
 from multidrop.polling.batch import Rows
 from multidrop.recording.format import Metadata
 
@@ -142,6 +142,20 @@ class Sources:
                 read |= {numbers[path]: known for path in paths}
         self._known |= read
 
+    def metadata(self) -> Metadata:
+        """Return the metadata of the newest segment; {} without segments."""
+        return self.again(self._newest_metadata)
+
+    def _newest_metadata(self, found: Listing) -> Metadata:
+        number = max([*found.segments, *found.rows], default=0)
+        if number in found.rows:
+            with self.cursor() as cursor, while_there([found.rows[number]]):
+                return kept_metadata(cursor, found.rows[number].path)
+        if number in found.segments:
+            with self.segment(number, found, *ALWAYS) as segment:
+                return segment.metadata if segment else {}
+        return {}
+
     def cursor(self) -> Any:
         """Return a cursor of DuckDB, which the caller closes. Raises ImportError."""
         with self._changing:
@@ -194,25 +208,20 @@ OF_TENS = "sum(n)::bigint, sum(missed)::bigint, sum(mean * n), min(least), max(m
 
 
 def rows_of_file(
-    sources: Sources,
-    file: HistoryFile,
-    series: Sequence[Series] | None,
-    begin: int,
-    end: int,
-    others: Iterable[OtherColumn],
+    sources: Sources, file: HistoryFile, query: Query, others: Iterable[OtherColumn]
 ) -> Iterator[Rows]:
-    """Yield the rows of the series (None: all series) by request time.
+    """Yield the rows of a query by request time.
 
     Raises Replaced if the file no longer exists, but only before the first row.
     """
-    condition, values = _condition(series)
+    condition, values = _condition(query)
     # Only `multidrop hub` writes files with several segments. Their rows come from several computers, whose
     # monotonic clocks differ, so sort them by UTC.
     order = "monotonic_ns" if file.first == file.last else "time"
     with sources.cursor() as cursor, while_there([file]):
         # Sorting reads the whole file before the first row, so Replaced cannot be raised between rows.
-        query = _ROWS.format(_columns(others), with_units([file.path]), condition) + f" order by {order}"
-        yield from rows_of(cursor, query, {"begin": begin, "end": end, **values})
+        selected = _ROWS.format(_columns(others), with_units([file.path]), condition)
+        yield from rows_of(cursor, f"{selected} order by {order}", values)
 
 
 def gather_files(
@@ -228,39 +237,29 @@ def gather_files(
     The column `unit` is read only if the metadata does not describe all series, because reading it doubles
     the time. Raises Replaced if a file no longer exists.
     """
-    condition, values = _condition(list(into))
-    values |= {"begin": grid.begin, "end": grid.end, "step": grid.step}
+    condition, values = _condition(Query(list(into), grid.begin, grid.end))
     paths = [file.path for file in files]
     is_known = all(series in described for series in into)
     unit, table = ("null, 0", files_of(paths)) if is_known else (_BY_UNIT, with_units(paths))
     query = _BUCKETS.format(unit=unit, sums=sums, files=table, condition=condition)
     with sources.cursor() as cursor, while_there(files):
-        found = cursor.execute(query, values).fetchall()
+        found = cursor.execute(query, values | {"step": grid.step}).fetchall()
     for drive, register, unit, newest_ns, bucket, n, missed, *numbers in found:
         into[drive, register].of_unit(unit, newest_ns).add(bucket, n, missed, *numbers)
 
 
-def units_in_rows(
-    sources: Sources, files: Sequence[HistoryFile], series: Sequence[Series] | None, begin: int, end: int
-) -> dict[int, FileUnits]:
+def units_in_rows(sources: Sources, files: Sequence[HistoryFile], query: Query) -> dict[int, FileUnits]:
     """Return each file's units, from its column `unit`; the key is the number of the file's first segment.
 
     Raises Replaced if a file no longer exists.
     """
-    condition, values = _condition(series)
-    query = _UNITS.format(files=with_units(file.path for file in files), condition=condition)
+    condition, values = _condition(query)
+    selected = _UNITS.format(files=with_units(file.path for file in files), condition=condition)
     known: dict[str, dict[Series, list[SeriesUnit]]] = {str(file.path): {} for file in files}
-    values |= {"begin": begin, "end": end}
     with sources.cursor() as cursor, while_there(files):
-        for path, drive, register, unit in cursor.execute(query, values).fetchall():
+        for path, drive, register, unit in cursor.execute(selected, values).fetchall():
             known[path].setdefault((drive, register), []).append(SeriesUnit(unit))
     return {file.first: known[str(file.path)] for file in files}
-
-
-def metadata_of(sources: Sources, file: HistoryFile) -> Metadata:
-    """Return the metadata of a file's segment. Raises Replaced if the file no longer exists."""
-    with sources.cursor() as cursor, while_there([file]):
-        return kept_metadata(cursor, file.path)
 
 
 def write_parquet(
@@ -268,29 +267,27 @@ def write_parquet(
     target: Path,
     batches: Iterable[Rows],
     files: Sequence[HistoryFile],
-    series: Sequence[Series] | None,
-    range_ns: tuple[int, int],
+    query: Query,
     metadata: Metadata,
     others: Mapping[int, Iterable[OtherColumn]],
 ) -> int:
     """Write a Parquet file, and return its number of rows.
 
-    It gets all rows of `batches`, and those rows of `files` that are in `series` and `range_ns`. `others` has
-    other names of registers, for their values in earlier units; the key is the number of a file's first
-    segment. Raises Replaced if a file no longer exists.
+    It gets all rows of `batches`, and those rows of `files` that the query selects. `others` has other names
+    of registers, for their values in earlier units; the key is the number of a file's first segment. Raises
+    Replaced if a file no longer exists.
     """
-    condition, values = _condition(series)
-    values |= dict(zip(("begin", "end"), range_ns, strict=True))
+    condition, values = _condition(query)
     with sources.cursor() as cursor, while_there(files):
         insert(cursor, batches)
-        query = f"select {COLUMNS} from recorded"
+        selected = f"select {COLUMNS} from recorded"
         alike: dict[str, list[HistoryFile]] = {}
         for file in files:
             alike.setdefault(_columns(others[file.first]), []).append(file)
         for columns, some in alike.items():
             found = _ROWS.format(columns, with_units(file.path for file in some), condition)
-            query += f" union all by name {found}"
-        return copy_out(cursor, query, target, metadata, values if files else {})
+            selected += f" union all by name {found}"
+        return copy_out(cursor, selected, target, metadata, values if files else {})
 
 
 def _columns(others: Iterable[OtherColumn]) -> str:
@@ -303,18 +300,18 @@ def _columns(others: Iterable[OtherColumn]) -> str:
     return f"replace (case {whens} else register end as register)" if whens else ""
 
 
-def _condition(series: Sequence[Series] | None) -> tuple[str, dict[str, Any]]:
-    """Return an SQL where clause that selects these series, and the values of its parameters."""
-    if series is None:
-        return "", {}
-    drives, registers = ({pair[at]: None for pair in series} for at in (0, 1))
-    values = {f"d{at}": name for at, name in enumerate(drives)}
-    values |= {f"r{at}": name for at, name in enumerate(registers)}
-    marks = {name: f"${mark}" for mark, name in values.items() if mark[0] == "d"}
-    others = {name: f"${mark}" for mark, name in values.items() if mark[0] == "r"}
-    condition = f" and drive in ({', '.join(marks.values())}) and register in ({', '.join(others.values())})"
+def _condition(query: Query) -> tuple[str, dict[str, Any]]:
+    """Return an SQL condition that selects the series, and the parameters of _IN_RANGE and this condition."""
+    values: dict[str, Any] = {"begin": query.begin, "end": query.end}
+    if query.series is None:
+        return "", values
+    drives = {name: f"d{at}" for at, name in enumerate(dict.fromkeys(drive for drive, _ in query.series))}
+    registers = {name: f"r{at}" for at, name in enumerate(dict.fromkeys(name for _, name in query.series))}
+    values |= {mark: name for marks in (drives, registers) for name, mark in marks.items()}
+    listed = (", ".join(f"${mark}" for mark in marks.values()) for marks in (drives, registers))
+    condition = " and drive in ({}) and register in ({})".format(*listed)
     # not every drive is wanted with every register, so select pairs, which is slower
-    if len(drives) * len(registers) > len(series):
-        pairs = ", ".join(f"({marks[drive]}, {others[register]})" for drive, register in series)
+    if len(drives) * len(registers) > len(query.series):
+        pairs = ", ".join(f"(${drives[drive]}, ${registers[register]})" for drive, register in query.series)
         condition += f" and (drive, register) in ({pairs})"
     return condition, values

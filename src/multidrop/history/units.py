@@ -175,7 +175,15 @@ class UnitHistory:
         return all(unit == self.newest[series] for unit in units)
 
 
-# ---- arguments of a query ----
+# ---- queries ----
+
+
+class Query(NamedTuple):
+    """Which rows to read: their series (None: all series), and their range of time in ns UTC."""
+
+    series: Sequence[Series] | None
+    begin: int
+    end: int  # the time of each row is less
 
 
 def parsed_series(series: str | Iterable[str] | None) -> list[Series] | None:
