@@ -358,7 +358,7 @@ def test_the_cache_of_unknown_series_is_limited(tmp_path: Path, monkeypatch: pyt
             (found,) = history.buckets(f"nobody.register-{at}", NOON, NOON + SECOND, 97).values()
             assert sum(found.n) == 0
             (segment,) = history._sources._growing.values()
-            assert len(segment._kept._kept) == min(at + 1, 3)
+            assert len(segment._kept) == min(at + 1, 3)
 
 
 def test_ten_second_summaries_are_computed_for_requested_series_only(tmp_path: Path) -> None:

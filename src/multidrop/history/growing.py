@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from array import array
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from math import isfinite
 from pathlib import Path
@@ -19,8 +19,33 @@ from multidrop.recording.arrow_decoder import RecordedColumns
 from multidrop.recording.arrows import ArrowsTail, BatchPlace
 
 MOST_TENS = 4096  # limit of series with cached ten-second summaries, because queries may name unknown series
+MOST_KEPT = 200_000  # limit of cached rows per segment: 4 MB
+MOST_SERIES = 4096  # limit of series with cached rows; requested series without rows count too
 
 Ten = list[float]  # a summary: number of values, number of failed reads; sum, least, greatest value
+
+
+class SeriesRow(NamedTuple):
+    """A row of a series; the value None is a failed read, or a value that is not finite."""
+
+    series: Series
+    time: int  # UTC in ns
+    value: float | None
+
+
+class SeriesRows:
+    """Rows of one series from a range of batches."""
+
+    def __init__(self, first: int) -> None:
+        self.first = self.past = first  # first batch number, and last batch number + 1
+        self.times = array("q")
+        self.values = array("d")
+        self.valid = bytearray()
+
+    def add(self, row: SeriesRow) -> None:
+        self.times.append(row.time)
+        self.values.append(0.0 if row.value is None else row.value)
+        self.valid.append(row.value is not None)
 
 
 class SeriesTens:
@@ -32,9 +57,9 @@ class SeriesTens:
         self.past = 0
         self.by_number: dict[int, Ten] = {}  # key: ten-second intervals since 1970
 
-    def add(self, time: int, value: float | None) -> None:
-        """Add a row; the value None is a failed read."""
-        ten = self.by_number.setdefault(time // TEN_NS, [0, 0, 0.0, float("inf"), float("-inf")])
+    def add(self, row: SeriesRow) -> None:
+        ten = self.by_number.setdefault(row.time // TEN_NS, [0, 0, 0.0, float("inf"), float("-inf")])
+        value = row.value
         if value is None:
             ten[1] += 1
             return
@@ -69,7 +94,7 @@ class GrowingSegment:
         self._holders = 1
         self._changing = threading.RLock()
         self._batches: list[IndexedBatch] = []
-        self._kept = KeptSeries(self._read)
+        self._kept: dict[Series, SeriesRows] = {}  # the least recently requested series first
         self._tens: dict[Series, SeriesTens] = {}
         self.metadata = self._tail.metadata
         self.damage: str | None = None
@@ -128,13 +153,50 @@ class GrowingSegment:
                 self._gather_rows(found, grid)
 
     def _gather_rows(self, found: Mapping[Series, Accumulator], grid: Grid) -> None:
-        for series, rows in self._kept.rows_of(found, self._batches_between(grid.begin, grid.end)).items():
-            found[series].add_rows(rows.times, rows.values, rows.valid)
+        if batches := self._batches_between(grid.begin, grid.end):
+            for series, rows in self._rows_in(batches, found).items():
+                found[series].add_rows(rows.times, rows.values, rows.valid)
+
+    def _rows_in(self, batches: range, series: Iterable[Series]) -> dict[Series, SeriesRows]:
+        """Return each series' rows in these batches, and maybe in others that a former query read.
+
+        The rows of recently requested series are cached, so that a live plot reads each batch once.
+        """
+        found = {}
+        for one in series:
+            rows = self._kept.pop(one, None)
+            if rows is None or not rows.first <= batches.start <= rows.past:
+                rows = SeriesRows(batches.start)
+            found[one] = rows
+        self._catch_up(found, batches.stop)
+        self._kept |= found
+        while len(self._kept) > MOST_SERIES or sum(len(one.times) for one in self._kept.values()) > MOST_KEPT:
+            del self._kept[next(iter(self._kept))]
+        return found
 
     def _batches_between(self, begin: int, end: int) -> range:
         """Return the range of batch numbers that includes all batches with rows in this time range."""
         found = [number for number, batch in enumerate(self._batches) if batch.may_have(begin, end)]
         return range(found[0], found[-1] + 1) if found else range(0)
+
+    def _gather_tens(self, found: Mapping[Series, Accumulator], grid: Grid) -> None:
+        if len(self._tens) > MOST_TENS:
+            self._tens.clear()
+        self._tens = {one: SeriesTens() for one in found} | self._tens
+        self._catch_up(self._tens, len(self._batches))
+        for series, into in found.items():
+            for number, (n, missed, *sums) in self._tens[series].by_number.items():
+                if grid.begin <= number * TEN_NS < grid.end:
+                    into.add((number * TEN_NS - grid.begin) // grid.step, int(n), int(missed), *sums)
+
+    def _catch_up(self, series: Mapping[Series, SeriesTens | SeriesRows], end: int) -> None:
+        """Add to each series its rows from the batches up to number `end` that it does not include yet."""
+        for number in range(min((one.past for one in series.values()), default=end), end):
+            behind = frozenset(name for name, one in series.items() if one.past <= number)
+            for row in self._read(number, behind):
+                series[row.series].add(row)
+        for one in series.values():
+            one.past = max(one.past, end)
 
     def _read(self, number: int, series: frozenset[Series]) -> Iterator[SeriesRow]:
         columns = self._tail.again(self._batches[number].place)
@@ -143,26 +205,6 @@ class GrowingSegment:
             value = columns.value[at]
             is_known = _is_set(columns.valid, at) and isfinite(value)
             yield SeriesRow(name, columns.time[at], value if is_known else None)
-
-    def _gather_tens(self, found: Mapping[Series, Accumulator], grid: Grid) -> None:
-        if len(self._tens) > MOST_TENS:
-            self._tens.clear()
-        self._tens = {one: SeriesTens() for one in found} | self._tens
-        self._update_tens()
-        for series, into in found.items():
-            for number, (n, missed, *sums) in self._tens[series].by_number.items():
-                if grid.begin <= number * TEN_NS < grid.end:
-                    into.add((number * TEN_NS - grid.begin) // grid.step, int(n), int(missed), *sums)
-
-    def _update_tens(self) -> None:
-        """Add new batches to the ten-second summaries of every requested series."""
-        end = len(self._batches)
-        for number in range(min((tens.past for tens in self._tens.values()), default=end), end):
-            behind = frozenset(series for series, tens in self._tens.items() if tens.past <= number)
-            for row in self._read(number, behind):
-                self._tens[row.series].add(row.time, row.value)
-        for tens in self._tens.values():
-            tens.past = end
 
 
 def _is_set(bits: bytes | None, at: int) -> bool:
@@ -206,66 +248,3 @@ def _rows(
                 columns.value[at] if _is_set(columns.valid, at) else None,
                 columns.statuses[columns.status[at]],
             )
-
-
-MOST_KEPT = 200_000  # limit of cached rows per segment: 4 MB
-MOST_SERIES = 4096  # limit of cached series; requested series without rows count too
-
-
-class SeriesRow(NamedTuple):
-    """A row of a series; the value None is a failed read, or a value that is not finite."""
-
-    series: Series
-    time: int  # UTC in ns
-    value: float | None
-
-
-class SeriesRows:
-    """Rows of one series from a range of batches."""
-
-    def __init__(self, first: int) -> None:
-        self.first = self.past = first  # first batch number, and last batch number + 1
-        self.times = array("q")
-        self.values = array("d")
-        self.valid = bytearray()
-
-    def add(self, row: SeriesRow) -> None:
-        self.times.append(row.time)
-        self.values.append(0.0 if row.value is None else row.value)
-        self.valid.append(row.value is not None)
-
-
-class KeptSeries:
-    """Caches the rows of recently requested series, so that a live plot reads each batch once.
-
-    `read` returns the rows of the given series in the batch with the given number.
-    """
-
-    def __init__(self, read: Callable[[int, frozenset[Series]], Iterable[SeriesRow]]) -> None:
-        self._read = read
-        self._kept: dict[Series, SeriesRows] = {}  # the least recently requested series first
-
-    def rows_of(self, series: Iterable[Series], batches: range) -> dict[Series, SeriesRows]:
-        """Return each series' rows in these batches. The result may include cached rows of other batches."""
-        if not batches:
-            return {}
-        found = {one: self._found(one, batches) for one in series}
-        # number of the first batch that must be read
-        begin = min((rows.past for rows in found.values()), default=batches.stop)
-        for number in range(begin, batches.stop):
-            for row in self._read(number, frozenset(one for one in found if found[one].past <= number)):
-                found[row.series].add(row)
-        for rows in found.values():
-            rows.past = max(rows.past, batches.stop)
-        self._kept.update(found)
-        while len(self._kept) > MOST_SERIES or self._rows() > MOST_KEPT:
-            del self._kept[next(iter(self._kept))]
-        return found
-
-    def _rows(self) -> int:
-        return sum(len(rows.times) for rows in self._kept.values())
-
-    def _found(self, series: Series, batches: range) -> SeriesRows:
-        """Return the series' cached rows if `batches` starts within or directly after them, else no rows."""
-        rows = self._kept.pop(series, None)
-        return rows if rows and rows.first <= batches.start <= rows.past else SeriesRows(batches.start)
