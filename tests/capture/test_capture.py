@@ -376,15 +376,17 @@ def test_a_decoded_capture_of_modbus_tcp_has_the_polled_values(captured: Capture
 NOT_ASKED = "not asked: drive is silent"
 
 
+def block(kind: int, body: bytes) -> bytes:
+    return struct.pack("<II", kind, len(body) + 12) + body + struct.pack("<I", len(body) + 12)
+
+
 def described(*options: tuple[int, bytes]) -> bytes:
     """Return a pcapng file without packets, and with one interface that has these options."""
     fields = b"".join(
         struct.pack("<HH", code, len(value)) + value + bytes(-len(value) % 4) for code, value in options
     )
-    interface = struct.pack("<HHI", 147, 0, 0) + fields
-    size = len(interface) + 12
-    section = struct.pack("<IIIHHqI", 0x0A0D0D0A, 28, 0x1A2B3C4D, 1, 0, -1, 28)
-    return section + struct.pack("<II", 1, size) + interface + struct.pack("<I", size)
+    section = block(0x0A0D0D0A, struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1))
+    return section + block(1, struct.pack("<HHI", 147, 0, 0) + fields)
 
 
 def test_capture_with_an_empty_time_resolution_option_is_read(tmp_path: Path) -> None:
@@ -396,10 +398,6 @@ def test_a_capture_with_a_huge_time_offset_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.pcapng").write_bytes(described((14, struct.pack("<q", 1 << 40))))
     with pytest.raises(CaptureError, match=r"byte 28: the time offset of 1099511627776 s is too large"):
         spans(tmp_path / "a.pcapng")
-
-
-def block(kind: int, body: bytes) -> bytes:
-    return struct.pack("<II", kind, len(body) + 12) + body + struct.pack("<I", len(body) + 12)
 
 
 def packet(interface: int, content: bytes, stated: int | None = None) -> bytes:
@@ -533,7 +531,7 @@ def test_size_of_the_read_buffer_does_not_change_decoded_rows(
         assert capture.truncated == len(OTHER_BLOCK) - 3
 
 
-OTHER_BLOCK = struct.pack("<II", 5, 1024) + bytes(1012) + struct.pack("<I", 1024)  # statistics
+OTHER_BLOCK = block(5, bytes(1012))  # statistics
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from captures import decimal, tshark
+from captures import decimal, spans, tshark
 from commands import Run
 from line_driver import MS, LineDriver
 from lines import PATIENCE, Faulty, LateWire, line, plant, polled, rows_of, served
@@ -25,7 +25,7 @@ from multidrop.capture import tap as flight
 from multidrop.capture.pcapng import WRAPPINGS
 from multidrop.capture.tap import AnomalyWatch
 from multidrop.cli.poll import tap_text
-from multidrop.core import Exchange, Framing, Message, NumberFormat, Peer, Splitter, Status, Tap
+from multidrop.core import Exchange, Framing, Message, NumberFormat, Peer, Status, Tap
 from multidrop.families import InnovertIBD
 from multidrop.plant.model import PolledDrive
 from multidrop.poller import Poller
@@ -315,14 +315,8 @@ class Flight:
 
 
 def seconds_in(path: Path) -> list[int]:
-    with Capture(path) as capture:
-        splitter = Splitter()
-        return [
-            span.time_ns // 10**9
-            for _ in capture
-            for stream in capture.streams
-            for span in splitter.spans(stream)
-        ]
+    (found,) = spans(path).values()
+    return [span.time_ns // 10**9 for span in found]
 
 
 def test_flight_recorder_saves_traffic_around_an_anomaly(

@@ -12,6 +12,7 @@ from functools import cache
 from pathlib import Path
 
 from modbus_requests import read_requests
+from recordings import is_kept
 
 from multidrop.capture import Capture, CaptureError, Decoding, Junk, Pairing
 from multidrop.core import Splitter
@@ -133,7 +134,7 @@ def read_recording(path: Path) -> None:
         rows = _comparable(batches)
         again = _written_again(path, ".arrows", reader.metadata, batches)
         assert len(again) == len(rows)
-        assert all(map(_is_kept, again, rows))
+        assert all(map(is_kept, again, rows))
         if reader.truncated:
             assert repair(path) == reader.truncated
             repaired = open_recording(path)
@@ -221,13 +222,6 @@ def _written_again(path: Path, suffix: str, metadata: Metadata, batches: list[Ro
             writer.write(batch)
     assert json.dumps(open_recording(copy).metadata) == json.dumps(metadata)
     return _comparable(open_recording(copy))
-
-
-def _is_kept(found: Row, written: Row) -> bool:
-    """Return True if the rows are equal, except that .arrows rounds the uncertainty up."""
-    bound, least = found.uncertainty_ns, written.uncertainty_ns
-    is_near = bound is least if bound is None or least is None else 0 <= bound - least <= abs(least) / 2**23
-    return is_near and found._replace(uncertainty_ns=0) == written._replace(uncertainty_ns=0)
 
 
 READERS: dict[str, tuple[str, Callable[[Path], None]]] = {  # reader: suffix of its files, function

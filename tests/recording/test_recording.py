@@ -17,6 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet
 import pytest
 from batches import EXAMPLE, METADATA, add_miss, add_rows, block, completion, counting, example
+from hypothesis import example as with_example
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from recordings import FILE_SCHEMA, SCHEMA, is_kept, record_as_before, rows_of
@@ -255,20 +256,22 @@ MISS = st.builds(Row, INT64, INT64, st.none(), NAME, NAME, st.none(), NAME)
 
 @every_format
 @pytest.mark.parametrize("target", FORMATS)
+@with_example(batches=[RECORDED])
 @settings(max_examples=examples(20), deadline=None)
 @given(batches=st.lists(st.lists(st.one_of(SAMPLE, NO_NUMBER, MISS), max_size=9), max_size=5))
-def test_converting_a_recording_keeps_all_rows(
+def test_converting_keeps_rows_and_metadata(
     tmp_path_factory: pytest.TempPathFactory, suffix: str, target: str, batches: list[list[Row]]
 ) -> None:
     """Values may be NaN, which does not equal itself, so the test compares texts."""
     folder = tmp_path_factory.mktemp("any")
-    with open_writer(folder / f"a{suffix}", {}) as writer:
+    with open_writer(folder / f"a{suffix}", METADATA) as writer:
         for some in filter(None, batches):
             writer.write(from_rows(some))
     written = [row for some in batches for row in some]
     assert convert(folder / f"a{suffix}", folder / f"b{target}") == len(written)
-    found = rows(open_recording(folder / f"b{target}"))
-    assert len(found) == len(written)
+    reader = open_recording(folder / f"b{target}")
+    found = rows(reader)
+    assert (reader.metadata, len(found)) == (METADATA, len(written))
     is_rounded = ".arrows" in (suffix, target)
     assert repr(found) == repr(written) or (is_rounded and all(map(is_kept, found, written)))
 
@@ -311,14 +314,6 @@ def test_csv_texts_that_look_like_formulas_are_escaped(tmp_path: Path) -> None:
     assert not [cell for cell in cells if cell.startswith(("=", "+", "-", "@", "\t", "\r"))]
     assert cells[6:] == ["''=1", "'" + "''-", "'old'", "a=b", ""]
     assert rows(open_recording(tmp_path / "a.csv")) == some
-
-
-@every_format
-@pytest.mark.parametrize("target", FORMATS)
-def test_converting_keeps_rows_and_metadata(tmp_path: Path, suffix: str, target: str) -> None:
-    assert convert(record(tmp_path / f"a{suffix}"), tmp_path / f"b{target}") == 2505
-    reader = open_recording(tmp_path / f"b{target}")
-    assert (reader.metadata, rows(reader)) == (METADATA, RECORDED)
 
 
 @pytest.mark.uncounted

@@ -14,6 +14,8 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from checksums import rtu
+
 REQUEST = 8  # number of bytes of a Modbus RTU read request
 MAKE = {0x02BC: 1, 0x02BE: 1}  # registers that identify an INNOVERT IBD: baud rate (1 means 9600) and address
 
@@ -135,7 +137,7 @@ class SerialHall:
         buffer += data
         while len(buffer) >= REQUEST:
             request = bytes(buffer[:REQUEST])
-            if _crc(request[:-2]) != request[-2:]:
+            if rtu(request[:-2]) != request:
                 del buffer[0]
                 continue
             del buffer[:REQUEST]
@@ -161,16 +163,6 @@ def _answer(client: socket.socket, request: bytes, *, takes_writes: bool) -> Non
     else:
         body = bytes([address, function | 0x80, 1])
     try:
-        client.sendall(body + _crc(body))
+        client.sendall(rtu(body))
     except OSError:
         return  # the client has closed the connection
-
-
-def _crc(data: bytes) -> bytes:
-    """Return the Modbus CRC (Modbus over serial line V1.02, 6.2.2)."""
-    crc = 0xFFFF
-    for byte in data:
-        crc ^= byte
-        for _ in range(8):
-            crc = crc >> 1 ^ 0xA001 if crc & 1 else crc >> 1
-    return crc.to_bytes(2, "little")
