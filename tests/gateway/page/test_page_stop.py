@@ -18,7 +18,10 @@ from watching import (
     Opener,
     aborting,
     await_new_value,
+    await_title,
+    center,
     press_enter,
+    stop_all,
     until,
     until_met,
     until_settled,
@@ -31,11 +34,6 @@ pytestmark = pytest.mark.long
 
 def title(page: Any) -> Any:
     return page.locator("#ask-title")
-
-
-def told(page: Any, title: str) -> None:
-    """Wait until the dialog has this title."""
-    page.get_by_role("heading", name=title, exact=True).wait_for()
 
 
 def test_the_stop_all_button_is_always_at_the_same_place_and_never_covered(opened: Opener) -> None:
@@ -64,7 +62,7 @@ def test_the_stop_all_button_works_on_a_phone_in_the_view_of_a_drive(
     page.locator("#stopall").tap()
     assert title(page).inner_text() == "Stop all 10 drives?"
     page.get_by_role("button", name="Stop all 10 drives").tap()
-    told(page, "All 10 drives are stopped")
+    await_title(page, "All 10 drives are stopped")
     assert gateway.posts == [("/api/stop", {"drives": None})]
 
 
@@ -82,7 +80,7 @@ def test_one_drive_can_be_stopped_by_keyboard_alone(opened: Opener, gateway: Fak
     page.keyboard.press("s")
     page.keyboard.press("Tab")
     page.keyboard.press("Enter")
-    told(page, "The drive is stopped")
+    await_title(page, "The drive is stopped")
     assert gateway.posts == [("/api/stop", {"drives": ["pump-2"]})]
     page.keyboard.press("Escape")
     assert not page.locator("#ask").evaluate("dialog => dialog.open")
@@ -96,7 +94,7 @@ def test_all_drives_can_be_stopped_by_keyboard_alone(opened: Opener, gateway: Fa
     page.keyboard.press("Shift+S")
     page.keyboard.press("Tab")
     page.keyboard.press("Enter")
-    told(page, "All 10 drives are stopped")
+    await_title(page, "All 10 drives are stopped")
     assert gateway.posts == [("/api/stop", {"drives": None})]
 
 
@@ -119,8 +117,7 @@ def test_the_stop_all_button_accepts_a_click_right_after_a_dialog_closed(
 ) -> None:
     """Even the second click of a double click is accepted, because it only opens the question."""
     page = opened("#/drives/pump-1")
-    box = page.locator("#stopall").bounding_box()
-    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    x, y = center(page.locator("#stopall"))
     page.get_by_role("button", name="start", exact=True).click()
     page.evaluate(
         """([x, y]) => Object.assign(document.querySelector('#ask button.calm').style, {
@@ -135,12 +132,12 @@ def test_the_stop_all_button_accepts_a_click_right_after_a_dialog_closed(
 
 def test_the_stop_all_button_works_while_another_dialog_is_open(opened: Opener, gateway: FakeGateway) -> None:
     page = opened("#/drives/pump-1")
-    box = page.locator("#stopall").bounding_box()
+    x, y = center(page.locator("#stopall"))
     page.get_by_role("button", name="Change frequency setpoint").click()
-    page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    page.mouse.click(x, y)
     assert title(page).inner_text() == "Stop all 10 drives?"
     page.get_by_role("button", name="Stop all 10 drives").click()
-    told(page, "All 10 drives are stopped")
+    await_title(page, "All 10 drives are stopped")
     assert gateway.posts == [("/api/stop", {"drives": None})]
 
 
@@ -153,14 +150,13 @@ def test_the_result_of_a_stop_does_not_replace_an_open_stop_dialog(
     page.get_by_role("button", name="Stop pump-1").click()
     page.get_by_role("button", name="Stop pump-1").last.click()
     until_met(page, lambda: gateway.posts)
-    box = page.locator("#stopall").bounding_box()
-    page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    page.mouse.click(*center(page.locator("#stopall")))
     with page.expect_response("**/api/stop"):
         gateway.is_held.set()
     page.wait_for_timeout(100)
     assert title(page).inner_text() == "Stop all 10 drives?"
     page.get_by_role("button", name="Stop all 10 drives").click()
-    told(page, "All 10 drives are stopped")
+    await_title(page, "All 10 drives are stopped")
     assert [body for _, body in gateway.posts] == [{"drives": ["pump-1"]}, {"drives": None}]
 
 
@@ -172,7 +168,7 @@ def test_the_stop_all_button_works_if_a_view_fails_to_load(opened: Opener, gatew
     page.locator("#stopall").click()
     assert title(page).inner_text() == "Stop all drives?"
     page.get_by_role("button", name="Stop all drives").click()
-    told(page, "All 10 drives are stopped")
+    await_title(page, "All 10 drives are stopped")
     assert gateway.posts == [("/api/stop", {"drives": None})]
 
 
@@ -185,28 +181,26 @@ def test_the_web_page_works_without_its_plot_library(opened: Opener) -> None:
 def test_the_result_of_a_stop_names_drives_still_running(opened: Opener, gateway: FakeGateway) -> None:
     gateway.outcomes = {"pump-3": {"done": False, "text": "no reply; it may still run"}}
     page = opened()
-    page.locator("#stopall").click()
-    page.get_by_role("button", name="Stop all 10 drives").click()
-    told(page, "1 of 10 drives are not confirmed as stopped")
+    stop_all(page)
+    await_title(page, "1 of 10 drives are not confirmed as stopped")
     assert page.locator("#ask .outcome li").all_inner_texts() == ["pump-3: no reply; it may still run"]
     assert "hard-wired stop" in page.locator("#ask").inner_text()
     gateway.outcomes = {}
     page.get_by_role("button", name="Send the stop again").click()
-    told(page, "All 10 drives are stopped")
+    await_title(page, "All 10 drives are stopped")
 
 
 def test_a_stop_without_an_answer_is_shown_as_unknown(opened: Opener, gateway: FakeGateway) -> None:
     page = opened()
     gateway.kill()
-    page.locator("#stopall").click()
-    page.get_by_role("button", name="Stop all 10 drives").click()
-    told(page, "It is unknown whether the stop was sent")
+    stop_all(page)
+    await_title(page, "It is unknown whether the stop was sent")
     assert "cannot be reached" in page.locator("#ask").inner_text()
     assert page.get_by_role("button", name="Send the stop again").is_visible()
 
 
 UNTAKEN = "The gateway has not accepted the stop"
-# Clicks "Close" in the next dialog as soon as the button is drawn.
+# Clicks "Close" in a dialog as soon as the button is drawn.
 CLOSED = """() => new MutationObserver((_, observer) => {
   const close = [...document.querySelectorAll('#ask button')].find(one => one.textContent === 'Close');
   if (close) { observer.disconnect(); close.click(); window.wasClosed = true; }
@@ -217,30 +211,28 @@ CLOSED = """() => new MutationObserver((_, observer) => {
 def test_a_frozen_gateway_is_reported_in_2_s(opened: Opener, gateway: FakeGateway, is_closed: bool) -> None:
     gateway.is_held = threading.Event()
     page = opened()
-    page.locator("#stopall").click()
     if is_closed:
         page.evaluate(CLOSED)
-    page.get_by_role("button", name="Stop all 10 drives").click()
+    stop_all(page)
     until_met(page, lambda: gateway.posts)
-    told(page, UNTAKEN)
+    await_title(page, UNTAKEN)
     assert page.evaluate("window.wasClosed === true") is is_closed
     assert "Use the hard-wired stop at the machine now." in page.locator("#ask p.bad").inner_text()
     gateway.is_held.set()
-    told(page, "All 10 drives are stopped")
+    await_title(page, "All 10 drives are stopped")
 
 
 def test_the_web_page_waits_for_the_result_of_an_accepted_stop(opened: Opener, gateway: FakeGateway) -> None:
     """A stop of silent drives may take half a minute."""
     gateway.is_held, gateway.confirms = threading.Event(), True
     page = opened()
-    page.locator("#stopall").click()
-    page.get_by_role("button", name="Stop all 10 drives").click()
+    stop_all(page)
     until_met(page, lambda: gateway.posts)
     page.wait_for_timeout(2500)
     assert title(page).inner_text() == "Stopping all 10 drives …"
     assert "The gateway has accepted the stop." in page.locator("#ask").inner_text()
     gateway.is_held.set()
-    told(page, "All 10 drives are stopped")
+    await_title(page, "All 10 drives are stopped")
 
 
 def test_a_warning_is_shown_if_an_emergency_stop_is_not_answered(
@@ -251,7 +243,7 @@ def test_a_warning_is_shown_if_an_emergency_stop_is_not_answered(
     page.route("**/api/act", lambda route: held.append(route))
     page.get_by_role("button", name="emergency stop").click()
     page.get_by_role("button", name="emergency stop pump-1").click()
-    told(page, UNTAKEN)
+    await_title(page, UNTAKEN)
     held[0].fulfill(json={"done": True, "text": "stopped"})
     page.locator("#outcomes li").wait_for()
 
@@ -259,26 +251,24 @@ def test_a_warning_is_shown_if_an_emergency_stop_is_not_answered(
 def test_typing_a_token_slowly_shows_no_warning(opened: Opener, gateway: FakeGateway) -> None:
     gateway.token = "right"
     page = opened()
-    page.locator("#stopall").click()
-    page.get_by_role("button", name="Stop all 10 drives").click()
+    stop_all(page)
     page.get_by_label("Token").fill("right")
     page.wait_for_timeout(2500)
     assert title(page).inner_text() == "Sign in"
     press_enter(page)
-    told(page, "All 10 drives are stopped")
+    await_title(page, "All 10 drives are stopped")
 
 
 def test_a_stop_asks_for_a_token_if_the_gateway_requires_one(opened: Opener, gateway: FakeGateway) -> None:
     gateway.token = "right"
     page = opened()
-    page.locator("#stopall").click()
-    page.get_by_role("button", name="Stop all 10 drives").click()
+    stop_all(page)
     page.get_by_label("Token").fill("wrong")
     press_enter(page)
     page.get_by_text("No such token is known.").wait_for()
     page.get_by_label("Token").fill("right")
     page.get_by_role("button", name="Sign in and send").click()
-    told(page, "All 10 drives are stopped")
+    await_title(page, "All 10 drives are stopped")
     assert gateway.posts == [("/api/stop", {"drives": None})]
 
 
@@ -307,10 +297,10 @@ def test_a_double_click_submits_the_sign_in_form_only_for_a_stop(
     page = opened(view)
     page.locator(asks).click()
     button = page.get_by_role("button", name=confirms, exact=True)
-    box = button.bounding_box()
+    x, y = center(button)
     button.click()
     page.get_by_label("Token").fill("right")
-    page.evaluate(SECOND_CLICK, [box["x"] + box["width"] / 2, box["y"] + box["height"] / 2])
+    page.evaluate(SECOND_CLICK, [x, y])
     if sent:
         until_met(page, lambda: gateway.posts)
     page.wait_for_timeout(300)  # time in which a further request would be sent
@@ -322,10 +312,9 @@ def test_a_stop_is_shown_as_not_sent_if_the_sign_in_is_cancelled(
 ) -> None:
     gateway.token = "right"
     page = opened()
-    page.locator("#stopall").click()
-    page.get_by_role("button", name="Stop all 10 drives").click()
+    stop_all(page)
     page.get_by_role("button", name="Cancel").click()
-    told(page, "The stop was not sent")
+    await_title(page, "The stop was not sent")
     assert gateway.posts == []
 
 
@@ -353,7 +342,7 @@ def test_eight_tabs_with_six_connections_show_live_values_and_can_stop_drives(
     page.keyboard.press("Shift+S")
     page.keyboard.press("Tab")
     page.keyboard.press("Enter")
-    told(page, "All 10 drives are stopped")
+    await_title(page, "All 10 drives are stopped")
     context.close()
 
 
@@ -386,7 +375,7 @@ def test_a_late_dialog_never_replaces_a_stop_dialog(opened: Opener, gateway: Fak
     page.wait_for_timeout(300)
     assert title(page).inner_text() == "Stop all 10 drives?"
     page.get_by_role("button", name="Stop all 10 drives").click()
-    told(page, "All 10 drives are stopped")
+    await_title(page, "All 10 drives are stopped")
     assert gateway.posts == [("/api/stop", {"drives": None})]
 
 

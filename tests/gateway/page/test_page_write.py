@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from fake_gateway import FakeGateway
 from gateways import served
-from watching import LIVE, Opener, press_enter, until, until_met, until_still
+from watching import LIVE, Opener, await_title, center, press_enter, until, until_met, until_still
 
 from multidrop.gateway.http.rights import Right
 
@@ -119,8 +119,7 @@ def test_a_double_click_on_start_does_not_confirm_the_dialog(
     until_still(page)
     start = page.get_by_role("button", name="start", exact=True)
     start.scroll_into_view_if_needed()
-    box = start.bounding_box()
-    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    x, y = center(start)
     page.evaluate(CONFIRMED_AT, [x, y])
     start.dblclick()
     assert page.locator("#ask").evaluate("dialog => dialog.open")
@@ -158,8 +157,7 @@ def test_a_second_tap_on_start_does_not_confirm_the_dialog(
     start.scroll_into_view_if_needed()
     if slows:
         start.evaluate(SLOW_AT_CLICKS)
-    box = start.bounding_box()
-    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    x, y = center(start)
     page.evaluate(CONFIRMED_AT, [x, y])
     made_s = time.time()
     tap(page, x, y, made_s)
@@ -321,10 +319,6 @@ def tab_to(page: Any, name: str) -> None:
     raise AssertionError(f"no way to {name}")
 
 
-def told(page: Any, title: str) -> None:
-    page.get_by_role("heading", name=title, exact=True).wait_for()
-
-
 def test_mistakes_are_shown_after_a_reload_by_keyboard(opened: Opener, gateway: FakeGateway) -> None:
     mistakes = [f"plant.toml: [[line]] {n}: port is missing" for n in range(30)]
     text = "the previous plant stays in use: the file has mistakes"
@@ -334,7 +328,7 @@ def test_mistakes_are_shown_after_a_reload_by_keyboard(opened: Opener, gateway: 
     press_enter(page)
     tab_to(page, READ_AGAIN)
     press_enter(page)
-    told(page, "Reload bottling plant.toml?")
+    await_title(page, "Reload bottling plant.toml?")
     press_enter(page)  # presses Cancel, which has the focus
     assert gateway.posts == []
     page.locator("#more").focus()
@@ -343,7 +337,7 @@ def test_mistakes_are_shown_after_a_reload_by_keyboard(opened: Opener, gateway: 
     press_enter(page)
     tab_to(page, "Reload bottling plant.toml")
     press_enter(page)
-    told(page, "The file has 30 mistakes")
+    await_title(page, "The file has 30 mistakes")
     assert page.locator("#ask .outcome li").all_inner_texts() == mistakes
     tab_to(page, "".join(mistakes))
     page.keyboard.press("End")
@@ -358,7 +352,7 @@ def test_the_page_offers_no_reload_without_a_plant_file_or_write_role(
         gateway.plant_changes = changed
         page = opened()
         page.locator("#more").click()
-        told(page, "Settings")
+        await_title(page, "Settings")
         assert page.get_by_role("button", name=READ_AGAIN).count() == 0
 
 
@@ -381,7 +375,7 @@ def test_reload_refuses_a_broken_plant_file_and_accepts_a_valid_one(page: Any, t
 
         path.write_text(good.replace('"invt-che"', '"invt-chf"').replace("= 38400", '= "fast"'))
         read()
-        told(page, "The file has 3 mistakes")
+        await_title(page, "The file has 3 mistakes")
         shown = page.locator("#ask .outcome li").all_inner_texts()
         assert shown == list(gateway.gateway.reload.mistakes)
         page.keyboard.press("Escape")
@@ -394,7 +388,7 @@ def test_reload_refuses_a_broken_plant_file_and_accepts_a_valid_one(page: Any, t
 
         path.write_text(good.replace('name = "pump-2"', 'name = "fan-2"') + "[serve.history]\n")
         read()
-        told(page, "plant.toml is in effect")
+        await_title(page, "plant.toml is in effect")
         assert page.locator("#ask .outcome li").all_inner_texts() == list(gateway.gateway.reload.restart)
         page.keyboard.press("Escape")
         # exact, because an alarm also links to fan-2

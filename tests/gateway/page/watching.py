@@ -135,6 +135,21 @@ def press_enter(page: Any) -> None:
     page.keyboard.press("Enter")
 
 
+def stop_all(page: Any) -> None:
+    page.locator("#stopall").click()
+    page.get_by_role("button", name="Stop all 10 drives").click()
+
+
+def await_title(page: Any, title: str) -> None:
+    """Wait until the dialog has this title."""
+    page.get_by_role("heading", name=title, exact=True).wait_for()
+
+
+def center(element: Any) -> tuple[float, float]:
+    box = element.bounding_box()
+    return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+
+
 def told(page: Any) -> str:
     """Return the texts in the page's header, for the message of a failed wait."""
     return str(
