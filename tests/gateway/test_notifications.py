@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import socket
 import sys
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import suppress
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from math import inf
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from forwarded import Posted, web_server
 from gateways import served
 from lines import PATIENCE, until
 from tables import table
@@ -192,52 +191,34 @@ def test_a_hanging_notification_target_does_not_delay_other_targets() -> None:
 
 
 @pytest.fixture
-def webhook() -> Iterator[SimpleNamespace]:
-    """A web server that records what is posted to it, and answers with `status`."""
-    state = SimpleNamespace(status=200, posted=[], url="")
-
-    class Handler(BaseHTTPRequestHandler):
-        def do_POST(self) -> None:
-            state.posted.append(json.loads(self.rfile.read(int(self.headers["content-length"]))))
-            self.send_response(state.status)
-            self.send_header("location", state.url)
-            self.send_header("content-length", "0")
-            self.end_headers()
-
-        def log_message(self, *arguments: object) -> None:
-            pass
-
-    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
-        state.url = f"http://127.0.0.1:{server.server_port}/secret-path"
-        thread = threading.Thread(target=server.serve_forever, args=[0.01])
-        thread.start()
-        yield state
-        server.shutdown()
-        thread.join()
+def webhook() -> Iterator[Posted]:
+    with web_server() as posted:
+        yield posted
 
 
 @pytest.mark.parametrize("status", [302, 404, 500])
-def test_a_webhook_gets_json_and_an_error_status_raises(webhook: SimpleNamespace, status: int) -> None:
+def test_a_webhook_gets_json_and_an_error_status_raises(webhook: Posted, status: int) -> None:
     send = sender_to(AlarmTarget("target", webhook.url))
     send(described(BEGUN, 0))
     webhook.status = status
     with pytest.raises(OSError, match=str(status)):
         send(described(over(BEGUN), 0))
-    assert [one["event"] for one in webhook.posted] == ["begin", "end"]
-    assert webhook.posted[0] == {
-        "event": "begin",
-        "title": "plant: pump",
-        "text": "pump: fault: overcurrent",
-        "plant": "plant",
-        "line": "",
-        "drive": "pump",
-        "kind": "fault",
-        "alarm": "overcurrent",
-        "id": "1000 fault pump",
-        "time": "1970-01-01T00:00:01.000Z",
-        "ended": None,
-        "page": "http://page/",
-    }
+    assert webhook.batches == [
+        {
+            "event": "begin",
+            "title": "plant: pump",
+            "text": "pump: fault: overcurrent",
+            "plant": "plant",
+            "line": "",
+            "drive": "pump",
+            "kind": "fault",
+            "alarm": "overcurrent",
+            "id": "1000 fault pump",
+            "time": "1970-01-01T00:00:01.000Z",
+            "ended": None,
+            "page": "http://page/",
+        }
+    ]
 
 
 def test_a_refused_connection_of_a_webhook_is_reported_in_one_sentence() -> None:
@@ -322,11 +303,11 @@ def test_a_missing_apprise_library_is_reported(tmp_path: Path, monkeypatch: pyte
 
 @pytest.mark.long
 @pytest.mark.filterwarnings("ignore:.*imghdr:DeprecationWarning")  # Apprise imports the deprecated imghdr
-def test_apprise_sends_the_title_and_the_text(webhook: SimpleNamespace) -> None:
+def test_apprise_sends_the_title_and_the_text(webhook: Posted) -> None:
     pytest.importorskip("apprise")
     send = sender_to(AlarmTarget("target", webhook.url.replace("http://", "json://")))
     send(described(BEGUN, 0))
-    [posted] = webhook.posted
+    [posted] = webhook.batches
     assert (posted["title"], posted["message"]) == ("plant: pump", "pump: fault: overcurrent")
     webhook.status = 500
     with pytest.raises(OSError, match="did not accept"):
@@ -334,19 +315,19 @@ def test_apprise_sends_the_title_and_the_text(webhook: SimpleNamespace) -> None:
 
 
 @pytest.mark.slow
-def test_faults_and_exceeded_limits_are_sent_as_messages(tmp_path: Path, webhook: SimpleNamespace) -> None:
+def test_faults_and_exceeded_limits_are_sent_as_messages(tmp_path: Path, webhook: Posted) -> None:
     (tmp_path / "targets").write_text(webhook.url)
     limit = '[[serve.limit]]\ndrive = "pump-1"\nregister = "output_frequency"\nabove = 100.0\n'
     below = limit.replace("above = 100.0", "below = 1.0")
     with served(tmp_path, f"[serve.notify]\n{limit}{below}") as gateway:
         gateway.await_state("pump-1", "stands")
         gateway.sims["pump-1"].trip(4)  # type: ignore[attr-defined]
-        until(lambda: len(webhook.posted) == 2)
+        until(lambda: len(webhook.batches) == 2)
         webhook.status = 500
         gateway.sims["pump-1"].motor.reset()  # type: ignore[attr-defined]
         until(lambda: "500" in gateway.get("/health").json["parts"].get("notify", ""))
         assert "secret-path" not in gateway.get("/health").body.decode()
-    found = {(one["drive"], one["kind"]): one["alarm"] for one in webhook.posted[:2]}
+    found = {(one["drive"], one["kind"]): one["alarm"] for one in webhook.batches}
     assert found.keys() == {("pump-1", "limit"), ("pump-1", "fault")}
     assert found["pump-1", "limit"] == "output_frequency below 1 Hz"
     # The status may be read before the register that has the number of the fault.

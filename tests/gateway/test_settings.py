@@ -327,34 +327,33 @@ def test_mistakes_in_triggers_are_reported(tmp_path: Path, keys: str, sentences:
 
 
 @table(
-    ("serve", "sentence"),
+    ("serve", "sentences"),
     [
         (
-            '[serve.modbus]\nlisten = "127.0.0.1:8750"',
-            "[serve.modbus]: listen: port 8750 is in use by listen of [serve]",
+            '[serve.modbus]\nlisten = "127.0.0.1:8750"\n[serve.opcua]\nlisten = "127.0.0.1:8750"',
+            [
+                "[serve.modbus]: listen: port 8750 is in use by listen of [serve]",
+                "[serve.opcua]: listen: port 8750 is in use by listen of [serve]",
+            ],
         ),
         (
             '[serve]\nlisten = "localhost:4840"\n[serve.opcua]',
-            "[serve.opcua]: listen: port 4840 is in use by listen of [serve]",
+            ["[serve.opcua]: listen: port 4840 is in use by listen of [serve]"],
         ),
         (
             '[serve]\nbehind_proxy = true\nlisten = "0.0.0.0:1503"\n[serve.modbus]\nports = { hall = 1503 }',
-            "[serve.modbus]: ports.hall: port 1503 is in use by listen of [serve]",
+            ["[serve.modbus]: ports.hall: port 1503 is in use by listen of [serve]"],
         ),
         (
             '[serve.modbus]\n[serve.tool]\nclients = ["::1"]\nrtu = { hall = "[::]:1502" }',
-            "[serve.tool]: rtu.hall: port 1502 is in use by listen of [serve.modbus]",
+            ["[serve.tool]: rtu.hall: port 1502 is in use by listen of [serve.modbus]"],
         ),
     ],
 )
-def test_a_tcp_port_in_two_settings_is_reported(tmp_path: Path, serve: str, sentence: str) -> None:
-    assert mistakes(tmp_path, f"{serve}\n") == [f"{sentence}; choose another port"]
-
-
-def test_each_setting_with_a_used_tcp_port_is_reported_once(tmp_path: Path) -> None:
-    serve = '[serve.modbus]\nlisten = "127.0.0.1:8750"\n[serve.opcua]\nlisten = "127.0.0.1:8750"\n'
-    in_use = "listen: port 8750 is in use by listen of [serve]; choose another port"
-    assert mistakes(tmp_path, serve) == [f"[serve.modbus]: {in_use}", f"[serve.opcua]: {in_use}"]
+def test_each_setting_with_a_used_tcp_port_is_reported_once(
+    tmp_path: Path, serve: str, sentences: list[str]
+) -> None:
+    assert mistakes(tmp_path, f"{serve}\n") == [f"{one}; choose another port" for one in sentences]
 
 
 def test_two_settings_may_use_the_same_tcp_port_on_different_addresses(tmp_path: Path) -> None:

@@ -86,7 +86,7 @@ def rows_at_noon(*given: tuple[str, str, float | None, str, str | None]) -> Any:
 
 
 class Posted:
-    """A web server that records posted JSON, and answers each request with the HTTP status `status`."""
+    """A web server that answers with the HTTP status `status`, and records the JSON it accepts."""
 
     def __init__(self) -> None:
         self.status = 200
@@ -113,6 +113,7 @@ def web_server() -> Iterator[Posted]:
         def do_POST(self) -> None:
             body = self.rfile.read(int(self.headers["content-length"]))
             self.send_response(posted.take(body, {k.lower(): v for k, v in self.headers.items()}))
+            self.send_header("location", posted.url)  # for the statuses of a redirect
             self.send_header("content-length", "0")
             self.end_headers()
 
