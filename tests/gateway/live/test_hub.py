@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -36,7 +35,6 @@ from multidrop.gateway.live.views import describe_line
 from multidrop.gateway.metrics import OTHER, base_unit, plant_families
 from multidrop.gateway.modbus_server import words as modbus_words
 from multidrop.gateway.modbus_server.words import NO_NUMBER, CommonBlock
-from multidrop.gateway.mqtt.home_assistant import discovery
 from multidrop.polling.batch import Batch
 
 REGISTERS = ("status", "output_frequency", "output_current", "fault")
@@ -499,14 +497,6 @@ def test_prometheus_metrics_are_in_base_units() -> None:
     assert base_unit(InvtCHE(1).status).name == "code"
 
 
-def test_home_assistant_shows_values_of_unknown_scale_as_raw_counts() -> None:
-    topics = dict.fromkeys(("set", "stop", "state", "gateway", "available"), "topic")
-    details = {"prefix": "", "version": "1", "every_s": 1.0, "writable": ["pressure"], "takes_commands": True}
-    found = json.loads(discovery(Fan(1), [Fan.pressure], topics, **details))  # type: ignore[arg-type]
-    assert found["cmps"]["pressure_set"]["unit_of_measurement"] == "raw count"
-    assert "unit_of_measurement" not in found["cmps"]["pressure"]
-
-
 class Transmitter(Drive):
     """A user's own device class. Its registers have different numbers of decimals."""
 
@@ -521,17 +511,6 @@ def test_the_plant_description_gives_no_decimals_for_a_float_register() -> None:
     registers = {each["name"]: each for each in told["drives"][0]["registers"]}
     assert [registers[name]["digits"] for name in ("pressure", "level", "power")] == [None, 2, None]
     assert [registers[name]["step"] for name in ("pressure", "level")] == [None, 0.01]
-
-
-def test_home_assistant_gets_no_display_precision_for_a_float_register() -> None:
-    topics = dict.fromkeys(("set", "stop", "state", "gateway", "available"), "topic")
-    details = {"prefix": "", "version": "1", "every_s": 1.0, "writable": ["pressure", "level"]}
-    drive = Transmitter(1, name="tank")
-    said = json.loads(discovery(drive, drive.registers.values(), topics, takes_commands=True, **details))
-    parts = said["cmps"]
-    shown = [parts[name].get("suggested_display_precision") for name in ("pressure", "level", "power")]
-    assert shown == [None, 2, None]
-    assert [parts[f"{name}_set"]["step"] for name in ("pressure", "level")] == [0.001, 0.01]
 
 
 def test_a_reload_that_adds_drives_lets_values_stay_fresh_longer(clock: HubClock) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import os
 import signal
 import threading
@@ -18,7 +17,7 @@ from typing import Any, NamedTuple
 import pytest
 from brokers import Broker as BrokerProcess
 from brokers import Broker as RunningBroker
-from brokers import Listener, Running, has, mosquitto, nats
+from brokers import Listener, Start, has, mosquitto, nats
 from gateways import Served, gateway_of, plant_text, running, tokens
 from lines import HOST_LATE, until
 from nats_clusters import old_server_program
@@ -316,9 +315,7 @@ def test_polling_is_unchanged_while_the_mqtt_broker_is_frozen_or_gone(tmp_path: 
         heard = Listener(broker, "multidrop/#")
         for name in DRIVES:
             heard.wait_for(
-                lambda one, topic=f"multidrop/{name}": (
-                    one.topic == topic and json.loads(one.payload)["time"] > came_back_ms
-                )
+                lambda one, topic=f"multidrop/{name}": one.topic == topic and one.json["time"] > came_back_ms
             )
         heard.close()
         until(lambda: gateway.get("/health").json["parts"]["mqtt"] == "ok")
@@ -400,9 +397,6 @@ async def test_a_command_is_not_sent_after_its_age_limit(monkeypatch: pytest.Mon
     assert commands.deadlines == [102 * 10**9]
 
 
-Start = Callable[..., tuple[Any, Running]]
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("broker", [lambda folder: nats(folder, old_server_program())], indirect=True)
 def test_json_topics_are_published_although_the_broker_rejects_sparkplug(
@@ -415,9 +409,6 @@ def test_json_topics_are_published_although_the_broker_rejects_sparkplug(
     known.hub.values[("pump-1", "output_frequency")] = 50.0
     running.step()
     listener.wait_for(
-        lambda heard: (
-            heard.topic == "multidrop/pump-1"
-            and json.loads(heard.payload)["values"]["output_frequency"] == 50.0
-        )
+        lambda heard: heard.topic == "multidrop/pump-1" and heard.json["values"]["output_frequency"] == 50.0
     )
     assert "multidrop/gateway" not in [h.topic for h in listener.all if h.payload == b"offline"]

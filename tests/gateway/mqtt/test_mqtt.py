@@ -6,45 +6,33 @@ import asyncio
 import json
 import signal
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import replace
-from datetime import UTC, datetime
-from enum import IntEnum
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from brokers import FAN, WITH_NATS, Broker, Listener, Published, Running, has, inside, publish, without_fan
+from brokers import FAN, WITH_NATS, Broker, Listener, Running, Start, has, inside, publish, without_fan
 from free_ports import free_port
 from gateways import certificate, served
 from lines import until
 from peers import require_module
-from tables import in_turn, table
+from tables import in_turn
 
 from multidrop import Drive, InvtCHE, PolledDrive
-from multidrop.channels import Channel
 from multidrop.control import CommandOutcome, CommandResult
 from multidrop.core import boottime_ns
-from multidrop.drive.number_format import NumberFormat
-from multidrop.drive.register import reading, setting
-from multidrop.families import MODELS
 from multidrop.gateway.http.rights import COMMAND_ID
 from multidrop.gateway.mqtt.broker import MOST_UNDER_WAY
-from multidrop.gateway.mqtt.home_assistant import discovery, discovery_topic
+from multidrop.gateway.mqtt.home_assistant import discovery_topic
 from multidrop.gateway.mqtt.json_topics import JsonTopics
 from multidrop.gateway.mqtt.part import build
 from multidrop.gateway.mqtt.settings import MqttSettings
 from multidrop.plant import RESERVED_NAMES
 
-Start = Callable[..., tuple[Any, Running]]
-
 STOPS = ["coast", "emergency_stop", "stop"]
-
-
-def json_of(received: Published) -> Any:
-    return json.loads(received.payload)
 
 
 def now_ms() -> int:
@@ -69,7 +57,7 @@ def test_the_mqtt_broker_retains_the_newest_values(
     with closing(Listener(broker)) as later:
         said = later.wait_for(has("multidrop/pump-1"))
     assert said.is_retained
-    assert json_of(said) == {
+    assert said.json == {
         "time": 7,
         "state": "runs",
         "fault": None,
@@ -87,7 +75,7 @@ def test_mqtt_shows_stale_values_as_null_and_silent_drives_as_offline(
     running.step()
     listener.wait_for(has("multidrop/pump-1/available", b"offline"))
     said = [received for received in listener.all if received.topic == "multidrop/pump-1"][-1]
-    assert json_of(said)["values"]["output_frequency"] is None
+    assert said.json["values"]["output_frequency"] is None
 
 
 @WITH_NATS
@@ -184,7 +172,7 @@ def test_publishing_never_waits_for_a_frozen_broker(broker: Broker, listener: Li
     broker.signal(signal.SIGCONT)
     listener.wait_for(
         lambda received: (
-            received.topic == "multidrop/pump-1" and json_of(received)["values"]["output_frequency"] == 499.0
+            received.topic == "multidrop/pump-1" and received.json["values"]["output_frequency"] == 499.0
         )
     )
     figures = {family.name: list(family.samples) for family in running._part.figures()}
@@ -213,7 +201,7 @@ def commanded(listener: Listener, start: Start) -> Any:
 
 
 def told(listener: Listener, drive: str = "pump-1") -> Any:
-    return json_of(listener.wait_for(has(f"multidrop/{drive}/told")))
+    return listener.wait_for(has(f"multidrop/{drive}/told")).json
 
 
 def write_of(value: object, time_ms: int, **more: object) -> bytes:
@@ -452,7 +440,7 @@ def test_other_messages_are_sent_if_one_answer_cannot_be_sent(
     known.hub.values[("pump-1", "output_frequency")] = 50.0
     running.step()
     listener.wait_for(
-        lambda one: one.topic == "multidrop/pump-1" and json_of(one)["values"]["output_frequency"] == 50.0
+        lambda one: one.topic == "multidrop/pump-1" and one.json["values"]["output_frequency"] == 50.0
     )
 
 
@@ -496,207 +484,6 @@ async def test_mqtt_commands_are_ignored_if_commands_are_disabled(tmp_path: Path
         part._formats[1].received(topic, b"Device Control/Stop", is_retained=is_retained)
     await asyncio.sleep(0)
     assert known.commands.noted == []
-
-
-def test_home_assistant_discovers_each_drive(broker: Broker, listener: Listener, start: Start) -> None:
-    start(home_assistant=True, commands=True, every="2 s")
-    said = listener.wait_for(has("homeassistant/device/multidrop-pump-1/config"))
-    found = json_of(said)
-    assert found["availability"] == [{"topic": "multidrop/gateway"}, {"topic": "multidrop/pump-1/available"}]
-    parts = found["cmps"]
-    assert set(parts) == {
-        *("state", "problem", "running", "output_frequency", "status", "setpoint_set", "stop")
-    }
-    assert len({part["unique_id"] for part in parts.values()}) == len(parts)
-    sensor = parts["output_frequency"]
-    assert (sensor["unit_of_measurement"], sensor["device_class"]) == ("Hz", "frequency")
-    assert sensor["expire_after"] == parts["state"]["expire_after"] == 6
-    assert "unit_of_measurement" not in parts["status"]
-    assert parts["setpoint_set"]["command_topic"] == "multidrop/pump-1/set/setpoint"
-
-
-def test_a_write_made_from_the_home_assistant_template_is_carried_out(
-    broker: Broker, listener: Listener, start: Start
-) -> None:
-    known, _ = start(home_assistant=True, commands=True)
-    said = listener.wait_for(has("homeassistant/device/multidrop-pump-1/config"))
-    part = json_of(said)["cmps"]["setpoint_set"]
-    publish(broker, part["command_topic"], command_of(part, 12.5).encode())
-    assert told(listener)["done"]
-    assert known.commands.noted == [("write", "pump-1", "setpoint", 12.5)]
-
-
-def test_home_assistant_object_ids_of_different_drives_differ(listener: Listener, start: Start) -> None:
-    start(home_assistant=True)
-    ids = {
-        listener.wait_for(lambda received: received.topic.startswith("homeassistant/")).topic
-        for _ in range(2)
-    }
-    assert len(ids) == 2
-    assert all(topic.isascii() for topic in ids)
-
-
-def configured(drive: Drive, polled: Sequence[str], writable: Sequence[str], **more: Any) -> Any:
-    topics = {name: f"multidrop/{name}" for name in ("state", "gateway", "available", "set", "stop")}
-    details: Any = {"prefix": "works", "version": "1", "every_s": 1.0, "takes_commands": True, **more}
-    registers = [drive.register(name) for name in polled]
-    return json.loads(discovery(drive, registers, topics, writable=writable, **details))
-
-
-def rendered(part: dict[str, Any], said: dict[str, Any]) -> str:
-    jinja2 = require_module("jinja2")
-    return str(jinja2.Environment().from_string(part["value_template"]).render(value_json=said))
-
-
-def command_of(part: dict[str, Any], value: object) -> str:
-    """Return the message that Home Assistant publishes for a new value of a component."""
-    template = require_module("jinja2").Environment().from_string(part["command_template"])
-    return str(template.render(value=value, now=lambda: datetime.now(UTC)))
-
-
-class Meter(Drive):
-    title = "ACME M-1"
-    net_energy = reading(0x0000, "kWh", number_format=NumberFormat.I32)
-    total_energy = reading(0x0002, "kWh", number_format=NumberFormat.U32)
-    float_energy = reading(0x0004, "kWh", number_format=NumberFormat.F32)
-    generated = reading(0x0006, "MWh", number_format=NumberFormat.U32)
-
-
-def test_an_energy_register_is_declared_increasing_only_if_it_cannot_fall() -> None:
-    names = ["net_energy", "total_energy", "float_energy", "generated"]
-    meter = Meter(1)
-    parts = configured(meter, names, [])["cmps"]
-    classes = ["total", "total_increasing", "total", "total_increasing"]
-    assert [parts[name]["state_class"] for name in names] == classes
-    assert {parts[name]["device_class"] for name in names} == {"energy"}
-
-
-def test_the_computed_energy_of_a_channel_is_not_declared_increasing() -> None:
-    topics = {name: name for name in ("state", "gateway", "available", "set", "stop")}
-    details: Any = {"prefix": "works", "version": "1", "every_s": 1.0, "takes_commands": True}
-    energy = Channel("energy", "integral(output_power)", "kWh").register
-    parts = json.loads(discovery(Meter(1), [energy], topics, writable=[], **details))["cmps"]
-    assert parts["energy"]["state_class"] == "total"
-
-
-# For each platform: the keys that Home Assistant requires, and the optional keys that we use. Source: Home
-# Assistant's documentation of MQTT, version 2026.11 (device discovery, sensor, binary sensor, number, select,
-# button).
-HA_KEYS = {
-    "sensor": (
-        {"state_topic"},
-        {"value_template", "expire_after", "device_class", "options", "state_class", "entity_category"}
-        | {"unit_of_measurement", "suggested_display_precision"},
-    ),
-    "binary_sensor": ({"state_topic"}, {"value_template", "expire_after", "device_class"}),
-    "number": (
-        {"command_topic", "min", "max"},  # without min and max, Home Assistant allows 1 to 100
-        {"state_topic", "value_template", "command_template", "retain", "step", "mode", "entity_category"}
-        | {"unit_of_measurement"},
-    ),
-    "select": (
-        {"command_topic", "options"},
-        {"state_topic", "value_template", "command_template", "retain", "entity_category"},
-    ),
-    "button": ({"command_topic"}, {"payload_press", "availability"}),
-}
-
-
-def check_components(found: Any) -> None:
-    # only the components of a device may have these keys
-    assert not {"state_topic", "command_topic", "value_template"} & found.keys()
-    assert found["dev"]["ids"]
-    for part in found["cmps"].values():
-        needed, known = HA_KEYS[part["p"]]
-        given = part.keys() - {"p", "unique_id", "name"}
-        assert needed <= given <= needed | known
-        assert ("state_topic" in part) == ("value_template" in part)
-        if part["p"] == "number":
-            assert part["min"] < part["max"]
-            assert part["step"] >= 0.001
-        if part.get("device_class") == "enum":
-            assert part["options"]
-            assert not {"unit_of_measurement", "state_class"} & part.keys()
-        assert part.get("entity_category") in (None, "diagnostic", *["config"] * (part["p"] != "sensor"))
-    ids = [part["unique_id"] for part in found["cmps"].values()]
-    assert len(set(ids)) == len(ids)
-
-
-@table("model", MODELS)
-def test_components_of_each_family_have_valid_home_assistant_keys(model: str) -> None:
-    drive = MODELS[model](1, name="pump-1")
-    registers = list(drive.registers)
-    polled = [name for name in registers if drive.register(name).readable]
-    writable = [name for name in registers if drive.register(name).writable]
-    found = configured(drive, polled, writable)
-    check_components(found)
-    assert len(found["cmps"]) == 4 + len(polled) + len(writable)
-
-
-class Awkward(Drive):
-    """A user's drive class whose registers have the names of Home Assistant components of the gateway."""
-
-    title = "ACME A-1"
-    running = reading(1, "Hz")
-    problem = reading(2, "V")
-    value = reading(3, "A")
-    level = setting(4, "m", moves=False)
-    level_set = reading(5, "m")
-    mode = setting(6, values=IntEnum("Mode", {"SLOW": 1, "FAST": 7}), moves=False)
-
-
-def test_registers_named_like_home_assistant_components_get_other_keys() -> None:
-    found = configured(Awkward(1, name="a"), [*Awkward.registers], ["level", "mode"], page="http://hall:8750")
-    check_components(found)
-    assert found["dev"] == {
-        **{"ids": "works-a", "name": "a", "mdl": "ACME A-1", "mf": "ACME", "cu": "http://hall:8750"}
-    }
-    parts = {part["unique_id"]: part for part in found["cmps"].values()}
-    assert parts["works-a-running"]["p"] == "binary_sensor"
-    assert parts["works-a-running-value"]["unit_of_measurement"] == "Hz"
-    assert parts["works-a-level-set"]["state_topic"] == "multidrop/state"
-    assert (parts["works-a-level-set"]["min"], parts["works-a-level-set"]["max"]) == (0, 65535)
-    mode = parts["works-a-mode-set"]
-    assert (mode["p"], mode["options"]) == ("select", ["SLOW", "FAST"])
-    assert json.loads(command_of(mode, "FAST"))["value"] == 7
-
-
-def test_a_home_assistant_number_of_an_unpolled_register_has_no_state() -> None:
-    part = configured(InvtCHE(1, name="a"), [], ["setpoint"])["cmps"]["setpoint_set"]
-    assert not {"state_topic", "value_template"} & part.keys()
-
-
-@table(
-    ("state", "problem", "running"),
-    [
-        ("runs", "OFF", "ON"),
-        ("stands", "OFF", "OFF"),
-        ("fault", "ON", "None"),
-        ("unknown", "None", "None"),
-        ("silent", "None", "None"),
-    ],
-)
-def test_home_assistant_sensors_follow_the_drives_state(state: str, problem: str, running: str) -> None:
-    parts = configured(InvtCHE(1, name="a"), [], [])["cmps"]
-    assert [rendered(parts[key], {"state": state}) for key in ("problem", "running")] == [problem, running]
-    assert rendered(parts["state"], {"state": state}) in parts["state"]["options"]
-
-
-def test_a_status_value_without_a_name_is_shown_as_unknown_in_home_assistant() -> None:
-    """Home Assistant ignores a state outside the options, and would keep showing the previous one."""
-    part = configured(InvtCHE(1, name="a"), ["status"], [])["cmps"]["status"]
-    values = [rendered(part, {"values": {"status": value}}) for value in ("FORWARD", "77", None)]
-    assert values == ["FORWARD", "None", "None"]
-
-
-def test_the_home_assistant_stop_button_is_available_while_its_drive_is_silent() -> None:
-    parts = configured(InvtCHE(1, name="a"), [], [])["cmps"]
-    assert parts["stop"]["availability"] == [{"topic": "multidrop/gateway"}]
-
-
-def test_home_assistant_ids_of_two_gateways_differ() -> None:
-    names = [("a-b", "c"), ("a", "b-c"), ("a_2d_b", "c"), ("a", "b_c"), ("a", "b c")]
-    assert len({discovery_topic(*one) for one in names}) == len(names)
 
 
 def test_all_mistakes_in_the_mqtt_settings_are_reported(tmp_path: Path) -> None:
@@ -753,10 +540,11 @@ def test_a_plant_file_name_that_sparkplug_forbids_is_reported(tmp_path: Path) ->
 
 def test_words_of_mqtt_topics_are_not_allowed_as_drive_names(tmp_path: Path) -> None:
     topics = JsonTopics(MqttSettings(commands=True), inside(tmp_path), now_ms)
-    topics.outbox = PutMessages()
+    put_in: list[Any] = []
+    topics.outbox = SimpleNamespace(put=put_in.append)
     topics.connected()
     topics._report(FAN.name, "stop", CommandResult(CommandOutcome.DONE, "done"), "an-id")
-    said = {message.topic for message in topics.outbox.put_in} | {topic for topic, _ in topics.topics()}
+    said = {message.topic for message in put_in} | {topic for topic, _ in topics.topics()}
     words = {word for topic in said for word in topic.removeprefix("multidrop/").split("/")}
     ours = words - {"+", FAN.name, "pump-1"}
     assert ours == {"gateway", "alarms", "stop", "act", "set", "available", "told"}
@@ -794,17 +582,9 @@ def test_mqtt_metrics_have_help_texts(broker: Broker, tmp_path: Path) -> None:
         assert "one more for Sparkplug" in told["mqtt_connected"]
 
 
-class PutMessages:
-    """An outbox that records the messages put into it."""
-
-    def __init__(self) -> None:
-        self.put_in: list[Any] = []
-
-    def put(self, message: Any) -> None:
-        self.put_in.append(message)
-
-    def emptied(self) -> set[str]:
-        return {one.topic for one in self.put_in if one.is_retained and one.make() == b""}
+def emptied(put_in: Sequence[Any]) -> set[str]:
+    """Return the topics whose retained messages are deleted by these messages."""
+    return {one.topic for one in put_in if one.is_retained and one.make() == b""}
 
 
 def test_topics_of_removed_drives_are_deleted_on_the_next_connection(tmp_path: Path) -> None:
@@ -814,17 +594,18 @@ def test_topics_of_removed_drives_are_deleted_on_the_next_connection(tmp_path: P
     topics = JsonTopics(MqttSettings(home_assistant=True), known, now_ms)
     fan = f"multidrop/{FAN.name}"
     expected = {fan, f"{fan}/available", discovery_topic("multidrop", FAN.name)}
-    topics.outbox = PutMessages()
+    put_in: list[Any] = []
+    topics.outbox = SimpleNamespace(put=put_in.append)
     topics.adopt(without_fan(known))
-    assert topics.outbox.emptied() == expected
-    topics.outbox = PutMessages()
+    assert emptied(put_in) == expected
+    put_in.clear()
     topics.connected()
-    assert topics.outbox.emptied() == expected
+    assert emptied(put_in) == expected
     known.hub.names.append(FAN.name)
-    topics.outbox = PutMessages()
+    put_in.clear()
     topics.adopt(whole)
     topics.connected()
-    assert topics.outbox.emptied() == set()
+    assert emptied(put_in) == set()
 
 
 @pytest.mark.parametrize("is_known", [True, False])
@@ -832,10 +613,11 @@ def test_no_topic_is_deleted_while_the_plant_has_no_lines(tmp_path: Path, is_kno
     known = inside(tmp_path)
     plant = known.plant if is_known else replace(known.plant, lines=())
     topics = JsonTopics(MqttSettings(), known._replace(plant=plant), now_ms)
-    topics.outbox = PutMessages()
+    put_in: list[Any] = []
+    topics.outbox = SimpleNamespace(put=put_in.append)
     topics.received("multidrop/gateway", b"offline", is_retained=True)
     topics.received("multidrop/old/available", b"online", is_retained=True)
-    assert bool(topics.outbox.emptied()) is is_known
+    assert bool(emptied(put_in)) is is_known
 
 
 def test_topics_of_removed_drives_are_deleted(broker: Broker, listener: Listener, start: Start) -> None:

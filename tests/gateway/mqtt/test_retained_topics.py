@@ -8,6 +8,7 @@ import subprocess
 import time
 from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -183,7 +184,7 @@ def test_a_delayed_start_from_the_broker_is_refused_after_a_stop(tmp_path: Path)
 
         def told() -> str:
             found = listener.wait_for(lambda one: one.topic == "multidrop/pump-1/told")
-            return str(json.loads(found.payload)["text"])
+            return str(found.json["text"])
 
         motor = gateway.sims["pump-1"].motor  # type: ignore[attr-defined]
         try:
@@ -230,16 +231,14 @@ def test_values_and_alarms_of_a_computed_channel_are_published(tmp_path: Path) -
         closing(Listener(broker, "multidrop/#")) as listener,
     ):
         listener.wait_for(
-            lambda one: (
-                one.topic == "multidrop/pump-2" and json.loads(one.payload)["values"].get("half") == 25.0
-            )
+            lambda one: one.topic == "multidrop/pump-2" and one.json["values"].get("half") == 25.0
         )
         found = listener.wait_for(lambda one: one.topic.endswith("/rows") and b'"half"' in one.payload)
-        row = next(row for row in json.loads(found.payload)["rows"] if row["register"] == "half")
+        row = next(row for row in found.json["rows"] if row["register"] == "half")
         assert (row["drive"], row["value"], row["unit"], row["status"]) == ("pump-2", 25.0, "Hz", "ok")
         with closing(Listener(broker, "multidrop/#")) as later:
             found = later.wait_for(lambda one: one.topic == "multidrop/alarms" and one.payload != b"[]")
-        [alarm] = json.loads(found.payload)
+        [alarm] = found.json
         assert (alarm["drive"], alarm["kind"]) == ("pump-2", "limit")
         assert "half above 10 Hz" in alarm["text"]
 
@@ -251,16 +250,6 @@ PAGES = Path(__file__).parents[3] / "docs" / "gateway"
 FLOW: list[dict[str, Any]] = json.loads((PAGES / "node-red-flow.json").read_text("utf-8"))
 
 
-class Noted:
-    """An outbox that records the topics of messages."""
-
-    def __init__(self) -> None:
-        self.topics: list[str] = []
-
-    def put(self, message: Any) -> None:
-        self.topics.append(message.topic)
-
-
 def topics_of(kind: str) -> list[str]:
     return [node["topic"] for node in FLOW if node["type"] == kind]
 
@@ -268,10 +257,14 @@ def topics_of(kind: str) -> list[str]:
 def test_the_gateway_uses_each_topic_of_the_node_red_flow(tmp_path: Path) -> None:
     matches = require_module("paho.mqtt.client").topic_matches_sub
     topics = JsonTopics(MqttSettings(commands=True), inside(tmp_path), lambda: 7)
-    topics.outbox = noted = Noted()
+    put_in: list[Any] = []
+    topics.outbox = SimpleNamespace(put=put_in.append)
     topics.connected()
     topics._report("pump-1", "stop", CommandResult(CommandOutcome.DONE, "stopped"), "id")
-    published = [*noted.topics, "multidrop/pump-1/rows"]  # test_sparkplug.py tests the topic of rows
+    published = [
+        *(one.topic for one in put_in),
+        "multidrop/pump-1/rows",
+    ]  # test_sparkplug.py tests the topic of rows
     taken = [topic for topic, _ in topics.topics()]
     assert len(topics_of("mqtt in")) == 4
     for topic in topics_of("mqtt in"):

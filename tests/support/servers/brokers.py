@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import importlib.util
+import json
 import os
 import queue
 import socket
@@ -132,6 +133,10 @@ class Published(NamedTuple):
     topic: str
     is_retained: bool
     payload: bytes
+
+    @property
+    def json(self) -> Any:
+        return json.loads(self.payload)
 
 
 def has(topic: str, payload: bytes | None = None) -> Callable[[Published], bool]:
@@ -334,6 +339,9 @@ class Running:
     def cut(self, connection: int) -> None:
         """Break a connection without an MQTT disconnect message, as a power failure does."""
         self._part._brokers[connection]._client.socket().shutdown(socket.SHUT_RDWR)
+
+
+Start = Callable[..., tuple[Any, Running]]  # the fixture `start`
 
 
 ROOT = "spBv1.0/works/{}/line"
