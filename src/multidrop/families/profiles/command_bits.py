@@ -43,14 +43,8 @@ class CiA402Status(IntFlag):
     NO_QUICK_STOP = 1 << 5
     SWITCH_ON_DISABLED = 1 << 6
     WARNING = 1 << 7
-    BIT_8 = 1 << 8
     REMOTE = 1 << 9
     AT_REFERENCE = 1 << 10
-    BIT_11 = 1 << 11
-    BIT_12 = 1 << 12
-    BIT_13 = 1 << 13
-    BIT_14 = 1 << 14
-    BIT_15 = 1 << 15
 
 
 # control words that lead to "operation enabled", in this order
@@ -165,12 +159,6 @@ class ProfidriveStatus(IntFlag):
     ALARM = 1 << 7
     AT_SETPOINT = 1 << 8
     REMOTE = 1 << 9
-    BIT_10 = 1 << 10
-    BIT_11 = 1 << 11
-    BIT_12 = 1 << 12
-    BIT_13 = 1 << 13
-    BIT_14 = 1 << 14
-    BIT_15 = 1 << 15
 
 
 OFF, ON, START = 0x0476, 0x0477, 0x047F  # OFF and ON do not turn the motor: they do not enable operation
@@ -290,14 +278,12 @@ class DanfossStatus(IntFlag):
     NOT_COASTING = 1 << 2  # on an FC 101 this bit means "safety closed"
     TRIPPED = 1 << 3
     ERROR = 1 << 4
-    BIT_5 = 1 << 5
     TRIP_LOCKED = 1 << 6  # not used on an FC 101
     WARNING = 1 << 7
     AT_REFERENCE = 1 << 8
     BY_LINE = 1 << 9  # 1 in auto mode, in which the line commands the drive; 0 in hand mode
     IN_RANGE = 1 << 10
     RUNNING = 1 << 11
-    BIT_12 = 1 << 12
     VOLTAGE_WARNING = 1 << 13
     CURRENT_LIMIT = 1 << 14
     THERMAL_WARNING = 1 << 15
@@ -378,20 +364,8 @@ class OptidriveStatus(IntFlag):
 
     RUNNING = 1 << 0
     TRIPPED = 1 << 1
-    BIT_2 = 1 << 2
-    BIT_3 = 1 << 3
-    BIT_4 = 1 << 4
     STANDBY = 1 << 5
     READY = 1 << 6
-    BIT_7 = 1 << 7
-    CODE_0 = 1 << 8
-    CODE_1 = 1 << 9
-    CODE_2 = 1 << 10
-    CODE_3 = 1 << 11
-    CODE_4 = 1 << 12
-    CODE_5 = 1 << 13
-    CODE_6 = 1 << 14
-    CODE_7 = 1 << 15
 
 
 OPTIDRIVE_RESERVED = 0x9C  # bits 2, 3, 4 and 7 of the low byte
@@ -476,9 +450,6 @@ class YaskawaStatus(IntFlag):
     PARAMETER_ERROR = 1 << 8
     POWER_LOSS = 1 << 9
     SECOND_MOTOR = 1 << 10
-    BIT_11 = 1 << 11
-    BIT_12 = 1 << 12
-    BIT_13 = 1 << 13
     REFERENCE_BY_LINE = 1 << 14
     COMMANDED_BY_LINE = 1 << 15
 
