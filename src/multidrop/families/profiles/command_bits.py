@@ -72,6 +72,8 @@ class CiA402(Profile):
     stop_word: ClassVar[int] = SWITCH_ON
     coast_word: ClassVar[int] = 0x0000
     reset_word: ClassVar[int] = 0x0087
+    trip_bits: ClassVar[int] = CiA402Status.FAULT
+    running_bits: ClassVar[int] = CiA402Status.OPERATION_ENABLED
     roles = {
         **COMMON,
         "control": Role(
@@ -89,12 +91,6 @@ class CiA402(Profile):
             return ""
         known = status & MASK in (READY, SWITCHED_ON, ENABLED, QUICK_STOP)
         return "" if known else "this is not a state of CiA 402"
-
-    def _is_tripped(self, status: int) -> bool:
-        return bool(status & CiA402Status.FAULT)
-
-    def _turns(self, status: int) -> bool:
-        return bool(status & CiA402Status.OPERATION_ENABLED)
 
     def _condition(self, status: int) -> Condition:
         return Condition.DECELERATING if status & MASK == QUICK_STOP else super()._condition(status)
@@ -182,6 +178,8 @@ class Profidrive(Profile):
     stop_word: ClassVar[int] = 0x047E
     coast_word: ClassVar[int] = 0x047C
     reset_word: ClassVar[int] = 0x04FE
+    trip_bits: ClassVar[int] = ProfidriveStatus.TRIPPED
+    running_bits: ClassVar[int] = ProfidriveStatus.OPERATION_ENABLED
     roles = {
         **COMMON,
         "control": Role(
@@ -200,12 +198,6 @@ class Profidrive(Profile):
         if status & ProfidriveStatus.READY_TO_OPERATE and not status & ProfidriveStatus.READY_TO_SWITCH_ON:
             return "this would be ready to operate but not to switch on"
         return ""
-
-    def _is_tripped(self, status: int) -> bool:
-        return bool(status & ProfidriveStatus.TRIPPED)
-
-    def _turns(self, status: int) -> bool:
-        return bool(status & ProfidriveStatus.OPERATION_ENABLED)
 
     def _condition(self, status: int) -> Condition:
         if self._turns(status) and not status & ProfidriveStatus.READY_TO_OPERATE:
@@ -306,6 +298,8 @@ class DanfossFC(Profile):
     coast_word: ClassVar[int] = 0x0434
     reset_word: ClassVar[int] = 0x04BC
     start_word: ClassVar[int] = 0x047C
+    trip_bits: ClassVar[int] = DanfossStatus.TRIPPED | DanfossStatus.TRIP_LOCKED
+    running_bits: ClassVar[int] = DanfossStatus.RUNNING
     roles = {
         **COMMON,
         "control": Role(
@@ -321,12 +315,6 @@ class DanfossFC(Profile):
         if status & DanfossStatus.RUNNING and status & DanfossStatus.TRIPPED:
             return "this would be both running and tripped"
         return ""
-
-    def _is_tripped(self, status: int) -> bool:
-        return bool(status & (DanfossStatus.TRIPPED | DanfossStatus.TRIP_LOCKED))
-
-    def _turns(self, status: int) -> bool:
-        return bool(status & DanfossStatus.RUNNING)
 
     def _not_ready(self, status: int) -> str:
         if not status & DanfossStatus.BY_LINE:
@@ -389,6 +377,8 @@ class Optidrive(Profile):
     coast_word: ClassVar[int] = 0x0008
     reset_word: ClassVar[int] = 0x0004
     start_word: ClassVar[int] = 0x0001
+    trip_bits: ClassVar[int] = OptidriveStatus.TRIPPED
+    running_bits: ClassVar[int] = OptidriveStatus.RUNNING
     roles = {
         **COMMON,
         "control": Role(
@@ -403,16 +393,10 @@ class Optidrive(Profile):
     def _impossible(self, status: int) -> str:
         return "its reserved bits are set" if status & OPTIDRIVE_RESERVED else ""
 
-    def _is_tripped(self, status: int) -> bool:
-        return bool(status & OptidriveStatus.TRIPPED)
-
     def _fault(self) -> Script[str]:
         """Return the trip code in the status's high byte, named if the family has a register `fault`."""
         named = yield from super()._fault()
         return named or f"code {(yield from self._status()) >> 8}"
-
-    def _turns(self, status: int) -> bool:
-        return bool(status & OptidriveStatus.RUNNING)
 
     def _not_ready(self, status: int) -> str:
         return "" if status & (OptidriveStatus.READY | OptidriveStatus.RUNNING) else "is not ready to run"
@@ -468,6 +452,8 @@ class Yaskawa(Profile):
 
     stop_word: ClassVar[int] = 0
     reset_word: ClassVar[int] = YaskawaControl.RESET
+    trip_bits: ClassVar[int] = YaskawaStatus.FAULT
+    running_bits: ClassVar[int] = YaskawaStatus.RUNS
     roles = {
         **COMMON,
         "control": Role(
@@ -487,12 +473,6 @@ class Yaskawa(Profile):
         if status & YaskawaStatus.RUNS and status & YaskawaStatus.FAULT:
             return "this would be both running and in a fault"
         return "" if status else "no bit is set"
-
-    def _is_tripped(self, status: int) -> bool:
-        return bool(status & YaskawaStatus.FAULT)
-
-    def _turns(self, status: int) -> bool:
-        return bool(status & YaskawaStatus.RUNS)
 
     def _not_ready(self, status: int) -> str:
         if not status & YaskawaStatus.COMMANDED_BY_LINE:

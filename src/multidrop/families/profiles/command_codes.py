@@ -196,8 +196,9 @@ class Invt(Profile):
     def _impossible(self, status: int) -> str:
         return "" if status in tuple(cast(Any, self.status.values)) else "the profile has no such number"
 
-    def _is_tripped(self, status: int) -> bool:
+    def _tripped(self, status: int) -> Script[bool]:
         return status == InvtStatus.FAULT
+        yield
 
     def _turns(self, status: int) -> bool:
         return status not in (InvtStatus.STANDBY, InvtStatus.FAULT, InvtStatus.POWER_OFF)
