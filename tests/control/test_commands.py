@@ -111,6 +111,17 @@ def test_write_register_returns_a_result_instead_of_raising(
     assert (result.error is None) == result.ok
 
 
+def test_write_register_reports_another_value_of_the_drive_and_a_lost_reply() -> None:
+    line, drive, _ = one(InnovertIBD(1, name="mill"))
+    taken = write_register(drive, "acceleration_time", 6000.0)
+    assert (taken.outcome, taken.held) == (CommandOutcome.FAILED, "3600.0 s")
+    assert taken.text == "mill: acceleration_time = 6000.0 s: taken as 3600.0 s"
+    line.loses = is_write
+    lost = write_register(drive, "frequency", 20.0)
+    assert (lost.outcome, lost.held) == (CommandOutcome.UNKNOWN, "")
+    assert "unconfirmed: mill: " in lost.text
+
+
 class Threads(Supervisor):
     """A supervisor that can start only `threads` threads; then it raises `failure`."""
 
