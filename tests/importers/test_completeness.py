@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from imported import entries, gaps, omissions, only
+from imported import FILES, entries, gaps, omissions, only
 from tables import table
 
 from multidrop.importers import csv_tables, esphome, home_assistant, sunspec, telegraf, wb
@@ -376,53 +376,17 @@ def test_templates_of_other_protocols_and_invalid_files_are_skipped(bench: Any, 
     assert names == ["broken.json", "empty.json", "list.json", "other.json", "table.csv"]
 
 
-MODPOLL = """\
-# a meter
-device,meter,1,,
-poll,holding_register,0,40,BE_LE
-ref,voltage,0,uint16,r,V,0.1
-ref,energy,2,int64,r
-ref,power,8,float32,rw,W
-ref,alarm,19:15,bool,r
-ref,serial,20,string16,r
-ref,half,36,float16,r
-ref,reset,37,uint16,w
-poll,coil,0,16,BE_BE
-ref,coils,0,bool8,rw
-
-device,other,2
-poll,input_register,0x10,2,LE_LE
-ref,current,0x10,uint32,r
-"""
-OTHERS = {
-    "neuron.csv": "name,address,type\na,1!400001#BL,FLOAT\nb,1!400003#WS,INT64\n",
-    "iobroker.tsv": "_address\tname\ttype\tformula\n300001\ta\tuint16be\t\n300002\tb\tuint16be\tx*2\n",
-    "telegraf.conf": '[[inputs.modbus]]\nholding_registers = [{ name = "a", data_type = "INT32",'
-    ' byte_order = "CDAB", address = [1, 2] }]\n',
-    "home.yaml": "modbus:\n  - sensors:\n    - { name: a, address: 1, slave: 1, swap: byte }\n",
-    "esp.yaml": "modbus_controller: { address: 1 }\nsensor:\n"
-    "  - { platform: modbus_controller, register_type: read, address: 1, value_type: S_QWORD_R }\n",
-    "sunspec.json": '{"id": 1, "group": {"points": [{"name": "A", "type": "int16", "size": 1, "sf": "S"},'
-    '{"name": "S", "type": "sunssf", "size": 1}], "groups": [{"name": "r", "points": [{"name": "B"}]}]}}',
-}
-
-
-def test_device_files_of_the_program_modpoll_are_counted(bench: Any, tmp_path: Path) -> None:
-    (tmp_path / "meter.csv").write_text(MODPOLL)
-    coverage = covered(bench, tmp_path)
-    assert shares(coverage) == {"templates": (2, 1), "entries": (9, 8), "read": (9, 8)}
-    assert list(coverage.lacking()) == [("which bits bool8 means is not known", 1, 1)]
-    needed = {words: count for words, count, _ in coverage.needed()}
-    assert (needed["order of bytes or words"], needed["bits of a word"], needed["text"]) == (3, 1, 1)
-
-
-def test_device_files_of_all_other_supported_programs_are_counted(bench: Any, tmp_path: Path) -> None:
+def test_example_files_of_every_supported_program_are_counted(bench: Any, tmp_path: Path) -> None:
     pytest.importorskip("yaml")
-    for name, contents in OTHERS.items():
-        (tmp_path / name).write_text(contents)
+    for suffix, texts in FILES.items():
+        for number, text in enumerate(texts):
+            (tmp_path / f"{number}{suffix}").write_text(text)
     coverage = covered(bench, tmp_path)
-    assert shares(coverage) == {"templates": (6, 3), "entries": (10, 7), "read": (10, 7)}
-    assert {reason for reason, _, _ in coverage.lacking()} == {
+    assert shares(coverage) == {"templates": (10, 2), "entries": (85, 70), "read": (85, 71)}
+    lacking = {reason: count for reason, count, _ in coverage.lacking()}
+    assert sum(lacking.values()) == 85 - 70
+    assert lacking.keys() >= {
+        "which bits bool8 means is not known",
         "its order of bytes #WS",
         "its formula is a program",
         "its group repeats as often as the device says",

@@ -62,12 +62,20 @@ def test_iobroker_table_becomes_a_loadable_family(tmp_path: Path) -> None:
 
 
 def test_modpoll_table_becomes_loadable_families(tmp_path: Path) -> None:
-    device = only(tmp_path, "config.csv", MODPOLL)
-    assert (device.title, device.address) == ("meter", 7)
+    other_device = "device,other,2\npoll,input_register,0x10,2,LE_LE\nref,current,0x10,uint32,r\n"
+    device, other = devices(tmp_path, "config.csv", MODPOLL + other_device)
+    assert [(each.title, each.address) for each in (device, other)] == [("meter", 7), ("other", 2)]
+    assert entries(other) == {
+        "current": {"at": 16, "table": "input", "number_format": "U32", "order": "DCBA"}
+    }
+    assert entries(device)["alarm"] == {"at": "9C4AH", "part": "15"}
     assert entries(device)["energy"] == {
         "at": "9C48H", "unit": "kWh", "number_format": "U32", "order": "CDAB",
     }  # fmt: skip
-    assert omissions(device) == ["coils: which bits bool8 means is not known"]
+    assert omissions(device) == [
+        "coils: which bits bool8 means is not known",
+        "reset: is only written: a command is never imported",
+    ]
     assert "# gap: energy: it is written there" in family_text(device, "x")
     registers = loaded(tmp_path, device, "voltage", "power", "energy")
     assert registers["energy"].address == 40008

@@ -25,6 +25,8 @@ poll,coil,0,12,BE_BE
 ref,coils,0,bool8,rw
 poll,holding_register,40000,20,BE_LE
 ref,energy,40008,uint32,rw,kWh,
+ref,alarm,40010:15,bool,r
+ref,reset,40011,uint16,w
 """
 NEURON = """\
 group,name,address,attribute,type,description,decimal
