@@ -287,7 +287,6 @@ def test_a_capture_of_other_drives_cannot_be_replayed(capture: Path) -> None:
         Replay(capture, plant(Toy(2, name="other")))
 
 
-FIELDS = ("mbtcp.trans_id", "mbtcp.unit_id", "modbus.func_code", "modbus.reference_num")
 POLLED = ("output_current", "motor_speed")
 
 
@@ -343,18 +342,15 @@ def captured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Captured:
 @pytest.mark.long
 def test_wireshark_decodes_modbus_tcp(captured: Captured) -> None:
     _, path, rows = captured
-    fields = [word for field in FIELDS for word in ("-e", field)]
-    command = [require_program("tshark"), "-n", "-r", str(path), "-T", "fields", "-e", "_ws.col.Info"]
-    said = subprocess.run([*command, *fields], capture_output=True, text=True, check=True).stdout
-    lines = [line.split("\t") for line in said.splitlines()]
-    packets = [line for line in lines if line[1]]
-    assert len(packets) == len(lines)
-    answered = [packet for packet in packets if packet[2] == "3" and packet[0].strip().startswith("Response")]
-    asked = [packet for packet in packets if packet[2] == "3" and packet[0].strip().startswith("Query")]
+    packets = tshark(path)
+    read = [packet for packet in packets if packet["mbtcp.unit_id"] == "3"]
+    answered = [packet for packet in read if packet["_ws.col.Info"].strip().startswith("Response")]
+    asked = [packet for packet in read if packet["_ws.col.Info"].strip().startswith("Query")]
     assert len(answered) == len({row.monotonic_ns for row in rows if row.value is not None})
-    assert {each[1] for each in answered} <= {each[1] for each in asked}
-    assert {(packet[2], packet[3]) for packet in packets} == {("3", "3"), ("4", "3")}
-    assert "Malformed" not in said
+    assert {each["mbtcp.trans_id"] for each in answered} <= {each["mbtcp.trans_id"] for each in asked}
+    functions = {(packet["mbtcp.unit_id"], packet["modbus.func_code"]) for packet in packets}
+    assert functions == {("3", "3"), ("4", "3")}
+    assert not [packet for packet in packets if "Malformed" in packet["_ws.col.Info"]]
 
 
 @pytest.mark.slow

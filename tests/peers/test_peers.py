@@ -15,8 +15,9 @@ from urllib.parse import urlsplit
 import pytest
 from commands import BoundProcess
 from lines import HOST_LATE, patient, rows_of, until
+from modbus_tools import Mbpoll
 from own_drives import ADDRESSES
-from peers import build_with_libmodbus, require_module, require_program
+from peers import build_with_libmodbus, require_module
 from ptys import linked_ptys
 
 from multidrop.bus import Bus
@@ -199,25 +200,16 @@ def test_a_poller_reads_all_values_from_other_libraries_servers(name: str, tmp_p
     assert {(row.register, row.value) for row in rows if row.value is not None} == set(HELD.items())
 
 
-def mbpoll(port: str, address: int, options: str, *values: int) -> subprocess.CompletedProcess[str]:
-    place = urlsplit(port)
-    command = [require_program("mbpoll"), "-q", "-m", "tcp", "-p", str(place.port), "-o", "5", "-0"]
-    command += ["-a", str(address), *options.split(), str(place.hostname), *map(str, values)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60)
-
-
 def test_mbpoll_reads_and_writes_a_simulated_family_over_tcp() -> None:
     pump, fan = simulated(InnovertIBD(1)), simulated(InvtCHE(247))
     pump["output_current"], fan["output_voltage"] = 2.5, 231
     with Simulator([Wire([pump, fan], port="tcp://127.0.0.1:0", unpaced=True)]) as line:
-        port = line.wires[0].path
-        read = mbpoll(port, 1, "-r 3 -c 1 -t 4 -1")
-        assert ("[3]:", "25") in [tuple(row.split()) for row in read.stdout.splitlines()], read.stderr
-        read = mbpoll(port, 247, "-r 12291 -c 1 -t 4 -1")
-        assert ("[12291]:", "231") in [tuple(row.split()) for row in read.stdout.splitlines()], read.stderr
-        refused = mbpoll(port, 247, "-r 32779 -c 1 -t 4 -1")
-        assert "Illegal data address" in refused.stderr
-        assert mbpoll(port, 1, "-r 107 -t 4", 200).returncode == 0
+        place = urlsplit(line.wires[0].path)
+        mbpoll = Mbpoll(str(place.hostname), "-m", "tcp", "-p", str(place.port))
+        assert mbpoll.read(1, 3, 3, 1) == [25]
+        assert mbpoll.read(247, 3, 12291, 1) == [231]
+        assert mbpoll.read(247, 3, 32779, 1) == 2  # "illegal data address"
+        assert mbpoll.write(1, 6, 107, 200) == 0
     assert pump["acceleration_time"] == 20
 
 

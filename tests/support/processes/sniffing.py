@@ -6,7 +6,6 @@ import array
 import fcntl
 import json
 import os
-import selectors
 import signal
 import subprocess
 import sys
@@ -14,11 +13,13 @@ import termios
 import threading
 import tty
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 from commands import MULTIDROP, BoundProcess
 from lines import until
+from ptys import passing
 
 from multidrop.core import set_settings
 
@@ -93,27 +94,14 @@ def tapped(drives: str, baudrate: int, hear: Callable[[bytes], bytes] = bytes) -
     (master, master_port), (tap, tap_port) = os.openpty(), os.openpty()
     for port in (master_port, tap_port):
         tty.setraw(port)
-    reader, writer = os.pipe()
-    thread = threading.Thread(target=_copy, args=(behind, master, tap, reader, hear), daemon=True)
-    thread.start()
+
+    def take(other: int, said: bytes) -> None:
+        os.write(tap, hear(said))  # the listener gets a request before its reply
+        os.write(other, said)
+
     try:
-        yield os.ttyname(master_port), os.ttyname(tap_port)
+        with passing({behind: partial(take, master), master: partial(take, behind)}):
+            yield os.ttyname(master_port), os.ttyname(tap_port)
     finally:
-        os.write(writer, b"\0")
-        thread.join()
-        for fd in (behind, master, master_port, tap, tap_port, reader, writer):
+        for fd in (behind, master, master_port, tap, tap_port):
             os.close(fd)
-
-
-def _copy(behind: int, master: int, tap: int, stop: int, hear: Callable[[bytes], bytes]) -> None:
-    with selectors.DefaultSelector() as ready:
-        for fd in (behind, master, stop):
-            ready.register(fd, selectors.EVENT_READ)
-        while True:
-            for key, _ in ready.select():
-                if key.fd == stop:
-                    return
-                with suppress(OSError):
-                    said = os.read(key.fd, 1024)
-                    os.write(tap, hear(said))  # the listener gets a request before its reply
-                    os.write(master if key.fd == behind else behind, said)

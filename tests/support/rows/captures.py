@@ -39,7 +39,7 @@ FIELDS = (
     *("frame.interface_name", "frame.time_epoch", "frame.packet_flags_direction"),
     *("mbrtu.unit_id", "modbus.func_code", "modbus.exception_code", "modbus.reference_num"),
     *("modbus.word_cnt", "modbus.bit_cnt", "modbus.regval_uint16", "modbus.data", "mbrtu.crc16.status"),
-    *("modbus.request_frame", "data.data"),
+    *("modbus.request_frame", "data.data", "mbtcp.trans_id", "mbtcp.unit_id", "_ws.col.Info"),
 )
 
 

@@ -8,8 +8,9 @@ import selectors
 import socket
 import threading
 import tty
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from functools import partial
 from types import SimpleNamespace
 
 import pytest
@@ -22,30 +23,42 @@ from multidrop.core import set_settings
 def linked_ptys() -> Iterator[tuple[str, str]]:
     """Yield the paths of two ports. Each port receives the bytes written to the other."""
     masters, slaves = zip(*(os.openpty() for _ in range(2)), strict=True)
+    one, other = masters
     for slave in slaves:
         tty.setraw(slave)
-    reader, writer = os.pipe()
-    thread = threading.Thread(target=_copy, args=(masters, reader), daemon=True)
-    thread.start()
     try:
-        yield os.ttyname(slaves[0]), os.ttyname(slaves[1])
+        with passing({one: partial(os.write, other), other: partial(os.write, one)}):
+            yield os.ttyname(slaves[0]), os.ttyname(slaves[1])
     finally:
-        os.write(writer, b"\0")
-        thread.join()
-        for fd in (*masters, *slaves, reader, writer):
+        for fd in (*masters, *slaves):
             os.close(fd)
 
 
-def _copy(masters: tuple[int, ...], stop: int) -> None:
+@contextmanager
+def passing(takers: Mapping[int, Callable[[bytes], object]]) -> Iterator[None]:
+    """During the block, pass what each descriptor receives to its function."""
+    reader, writer = os.pipe()
+    thread = threading.Thread(target=_pass, args=(takers, reader), daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        os.write(writer, b"\0")
+        thread.join()
+        os.close(reader)
+        os.close(writer)
+
+
+def _pass(takers: Mapping[int, Callable[[bytes], object]], stop: int) -> None:
     with selectors.DefaultSelector() as ready:
-        for fd in (*masters, stop):
+        for fd in (*takers, stop):
             ready.register(fd, selectors.EVENT_READ)
         while True:
             for key, _ in ready.select():
                 if key.fd == stop:
                     return
                 with suppress(OSError):
-                    os.write(masters[1 - masters.index(key.fd)], os.read(key.fd, 1024))
+                    takers[key.fd](os.read(key.fd, 1024))
 
 
 PATIENCE = 60.0  # longest wait for a reply that must come, in s
