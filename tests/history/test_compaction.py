@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 from commands import BoundProcess
 from histories import DAY, METADATA, NOON, SECOND, check_buckets, random_rows, record, rows_in
+from interruptions import full_at
 from tables import usually
 
 from multidrop import open_recording, whole_file
@@ -288,10 +289,8 @@ def test_other_segments_are_read_if_one_is_empty(
 
 @pytest.mark.long
 def test_compaction_keeps_a_segment_if_the_disk_is_full(tmp_path: Path, rows: list[list[Row]]) -> None:
-    words = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (900, 900));"
-    words += f"from multidrop.history.compact import main; main([{str(tmp_path)!r}, '--below', '6'])"
-    ended = subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, check=False)
-    assert ended.returncode
+    with full_at(900), pytest.raises(duckdb.IOException, match="File too large"):
+        compact(tmp_path, 6)
     assert len(listing(tmp_path).segments) == 5
     for _ in range(2):
         check(tmp_path, [*chain(*rows)])
