@@ -147,7 +147,6 @@ struct md_before {
 struct md_turn {
     int source, last;     /* enum md_source: of the exchange in flight, and of the previous one */
     int is_ending;        /* 1: start no more polled exchanges */
-    int was_silent;       /* 1: the latest exchange's drive did not answer */
     int has_done_urgent;  /* an urgent exchange ended; the engine resets this flag */
     struct md_urgent *urgent;
     const struct md_exchange *const *round; /* the repeated exchanges */
@@ -156,6 +155,7 @@ struct md_turn {
     uint32_t room;         /* number of slots, a power of two */
     uint32_t is_idle;      /* 1: the thread may sleep, so md_port_submit() must wake it */
     int64_t owed_ns;       /* line time that polling must still get, because urgent requests took it */
+    int64_t answering_ns;  /* until then, stops of drives that answer precede stops of silent drives */
     struct md_before before;
     struct md_row_queue *row_queue;
     uint32_t number; /* the port's number in row_queue */

@@ -223,7 +223,8 @@ struct md_exchange {
     const struct md_exchange *echo_probe;
     struct md_settings settings;
     int framing;
-    int insists;          /* 1: a stop, sent even if a late reply may be mistaken for its reply */
+    uint16_t insists;      /* 1: a stop, sent even if a late reply may be mistaken for its reply */
+    uint16_t is_stop_read; /* 1: a read of a stop; it may precede stops of silent drives */
     uint32_t end;         /* upper bound (exclusive) of the reply's only register; 0: no range */
     uint16_t least;       /* lower bound (inclusive) of the reply's only register */
     uint8_t is_proof;     /* 1: the exchange is in its drive's list of proofs */

@@ -197,22 +197,24 @@ static int is_silent(const struct md_exchange *exchange)
 
 /* Move the first request that may be sent now to the front and return it; otherwise set wake_ns. While a stop
  * waits for its drive, send only other stops: the stop must not wait for further exchanges. After an exchange
- * with a silent drive, a stop of a drive that answers precedes the other requests: it would otherwise wait
- * for the timeouts of all silent drives that are being stopped. */
+ * with a silent drive, stops of drives that answer precede the other requests for as long as that exchange
+ * took: they would otherwise wait for the timeouts of all silent drives that are being stopped. */
 static struct md_urgent *find_urgent(struct md_turn *turn, int *is_held, int64_t *wake_ns, int64_t now_ns)
 {
     struct md_urgent **found = NULL;
     for (struct md_urgent **at = &turn->urgent; *at; at = &(*at)->next) {
         const struct md_exchange *exchange = (*at)->exchange;
-        int is_preferred = !turn->was_silent || (exchange->insists && !is_silent(exchange));
-        if (!exchange->insists && (found || *is_held))
+        int is_preferred = now_ns >= turn->answering_ns || exchange->is_stop_read ||
+                           (exchange->insists && !is_silent(exchange));
+        if (!exchange->insists && *is_held)
             break;
+        if (found && !is_preferred)
+            continue;
         if (!is_time(later((*at)->not_before_ns, ready_ns(exchange)), wake_ns, now_ns)) {
             *is_held |= exchange->insists;
             continue;
         }
-        if (is_preferred || !found)
-            found = at;
+        found = at;
         if (is_preferred)
             break;
     }
@@ -275,8 +277,11 @@ static void stop_repeating(struct md_turn *turn)
 
 /* ---- turns ---- */
 
-static void settle(struct md_turn *turn, int64_t took_ns)
+static void settle(struct md_turn *turn, int64_t took_ns, int64_t now_ns)
 {
+    const struct md_exchange *exchange = turn->line.exchange;
+    if (is_silent(exchange) && turn->source != MD_AHEAD)
+        turn->answering_ns = now_ns + (exchange->is_stop_read ? 0 : took_ns);
     if (turn->source == MD_URGENT)
         turn->owed_ns += took_ns / (POLLED - 1);
     else if (turn->source != MD_AHEAD && turn->owed_ns > 0)
@@ -362,7 +367,6 @@ static void finish(struct md_turn *turn)
 {
     int source = turn->source;
     turn->last = source;
-    turn->was_silent = is_silent(turn->line.exchange);
     turn->source = MD_NO_SOURCE;
     if (turn->progress.echo != (uint32_t)turn->line.echo)
         md_store(&turn->progress.echo, (uint32_t)turn->line.echo);
@@ -394,11 +398,12 @@ static void finish(struct md_turn *turn)
 }
 
 /* Put the postponed exchange back into its queue, because a stop must not wait for it. */
-static void give_way(struct md_turn *turn)
+static void give_way(struct md_turn *turn, int64_t now_ns)
 {
     int source = turn->source;
     md_line_put_back(&turn->line);
     turn->source = MD_NO_SOURCE;
+    turn->answering_ns = now_ns; /* otherwise a stop's read would be taken again */
     put_back(turn, source);
 }
 
@@ -409,7 +414,7 @@ int md_turn_want(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
         if (turn->source == MD_NO_SOURCE && !take(turn, wake_ns, now_ns))
             return MD_DONE;
         if (md_line_is_postponed(line) && is_stop_waiting(turn)) {
-            give_way(turn);
+            give_way(turn, now_ns);
             continue;
         }
         int want = md_line_want(line, now_ns);
@@ -420,7 +425,7 @@ int md_turn_want(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
         *wake_ns = line->wake_ns;
         if (want != MD_DONE)
             return want;
-        settle(turn, now_ns - line->completion->begun_ns);
+        settle(turn, now_ns - line->completion->begun_ns, now_ns);
         rest(line->exchange, line->completion, now_ns);
         finish(turn);
     }

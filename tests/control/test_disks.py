@@ -206,7 +206,7 @@ def test_a_repeated_stop_has_two_audit_records(monkeypatch: pytest.MonkeyPatch, 
     assert first == called
     assert (ended["outcome"], ended["sent"]) == ("sent but unknown", line.written[sent - 1])
     assert ended["frames"] == sent > 20
-    assert (all_called["drive"], all_called["outcome"]) == ("invt-che@1, invt-che@2", "called")
+    assert (all_called["drive"], all_called["outcome"]) == ("invt-che@2, invt-che@1", "called")
     assert {one["drive"]: one["outcome"] for one in each} == {
         "invt-che@1": "sent but unknown",
         "invt-che@2": "stopped",

@@ -516,34 +516,6 @@ def test_stop_overtakes_waiting_requests_and_cancels_earlier_starts(drive: Drive
     assert (found[50].result, found[50].sent_ns) == (Failure.EXPIRED, 0)
 
 
-def test_stops_of_silent_and_answering_drives_take_turns(drive: Drive) -> None:
-    """After each timeout, a stop of a drive that answers goes first; then a silent drive has its turn."""
-    requested: list[int] = []
-    go_on = threading.Event()
-
-    def answer(request: Message) -> bytes:
-        requested.append(request.start)
-        if len(requested) > 1:
-            return b"" if request.start >= 50 else echo_start(request)
-        go_on.wait(120)
-        return echo_start(request)
-
-    silent = [Peer(least_timeout=0.01, most_timeout=0.01) for _ in range(3)]
-    for peer in silent:
-        peer.c.failures = 1
-    with closing(Port(drive(answer), NO_SETTINGS)) as port:
-        stops = [read(50 + number, peer=peer, insists=True) for number, peer in enumerate(silent)]
-        stops += [read(10, insists=True), read(11, insists=True)]
-        threads = [threading.Thread(target=port.carry_out, args=[each]) for each in (read(0), *stops)]
-        for thread in threads:
-            thread.start()
-            wait_until_it_sleeps(thread)  # so that the waiting requests arrive in this order
-        go_on.set()
-        for thread in threads:
-            thread.join(120)
-    assert requested == [0, 50, 10, 51, 11, 52]
-
-
 def test_write_permit_from_before_or_during_a_stop_stays_invalid() -> None:
     latch = Latch()
     before = latch.permit()

@@ -17,7 +17,7 @@ from toy import Picky, Toy, family
 
 from multidrop.control.call import Call
 from multidrop.control.stops import StopAttempt, stop_together
-from multidrop.core import Latch, Message
+from multidrop.core import Latch, Message, Peer
 from multidrop.drive import Drive
 from multidrop.drive.register import HOLDING, reading
 from multidrop.drive.verbs import Insist, Script
@@ -454,9 +454,8 @@ def test_the_pause_of_one_drive_does_not_delay_the_stop_of_another(monkeypatch: 
     def do(stop: StopAttempt, step: object) -> None:
         sent.append(stop.drive.name)
 
-    stops = [
-        StopAttempt(first, script, now[0], None, lambda: now[0] + INTERVAL),
-        StopAttempt(second, script, now[0], None),
-    ]
+    resting = Peer(least_timeout=1.0, most_timeout=1.0)
+    resting.c.ready_ns = round((now[0] + INTERVAL) * 1e9)
+    stops = [StopAttempt(drive, script, now[0], None, {first: resting}) for drive in (first, second)]
     stop_together(stops, do, lambda stop: None)
     assert sent == ["other", "slow"]

@@ -6,7 +6,7 @@ Several stops take turns step by step, so that no stop waits for another motor's
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from math import inf
@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 from multidrop.control.call import Latches
 from multidrop.control.outcome import UNSEEN, Outcome, Seen, Stopped, result_of_stop
 from multidrop.control.writer import Checked, Writer
-from multidrop.core import Message
+from multidrop.core import Message, Peer
 from multidrop.drive.family import Drive
 from multidrop.drive.verbs import CommandResult, Pulse, Read, Script, Step, Wait, Write
 from multidrop.errors import (
@@ -61,8 +61,7 @@ class StopAttempt:
 
     The stop is repeated for `seconds`. If `seconds` is None, no repetition starts after LEAST_S, and the last
     one may take as long as the motor's ramp. After AT_ONCE steps without a good reply, the stop uses less
-    than half of the line's time, and leaves the rest to other requests. `ready` returns the time (in s)
-    before which no request may be sent to the drive.
+    than half of the line's time, and leaves the rest to other requests.
     """
 
     def __init__(
@@ -71,10 +70,10 @@ class StopAttempt:
         script: Callable[[], Script[Any]],
         begun: float,
         seconds: float | None,
-        ready: Callable[[], float] = lambda: 0.0,
+        peers: Mapping[Drive, Peer],
     ) -> None:
         self.drive = drive
-        self.ready = ready
+        self._peers = peers  # the core's records of the drives that are attached
         self.due = begun
         self.failure: Exception | None = None
         self.is_sent = False  # whether a stop was sent that the drive did not refuse
@@ -83,6 +82,8 @@ class StopAttempt:
         self._make = script
         self.times_sent = 0  # number of stops sent, including those that the drive refused
         self._unanswered = 0  # number of steps without a good reply
+        self._is_answered = False  # whether the drive has answered the latest write
+        self.others_first_until = begun  # time in s until which stops of drives that answer go first
         self.is_over = False
         self.ended = begun  # time in s at which the attempt ended
         # SystemExit or similar, raised by the script; kept until all stops are over
@@ -182,15 +183,28 @@ class StopAttempt:
         self._resume = lambda: script.send(None)
 
     def _share_line(self, begun: float, now: float) -> None:
-        """After a step without a good reply, delay the next step, so that other requests can use the line.
+        """After a step without a good reply, leave the line to other requests before the next step.
 
-        Do not delay it beyond the time limit of the stop.
+        Stops that were answered go first for as long as the step took. After AT_ONCE such steps, other
+        requests get the line for longer, but not beyond the time limit of the stop.
         """
         self._unanswered += 1
+        if self.gives_way():
+            self.others_first_until = now + (now - begun)
         limit = LEAST_S if self._seconds is None else self._seconds
         due = now + SHARE * (now - begun)
         if self._unanswered > AT_ONCE and due < self._begun + limit:
             self.due = due
+
+    def gives_way(self) -> bool:
+        """Return True if the drive is silent and has not answered the latest write of this stop."""
+        peer = self._peers.get(self.drive)
+        return not self._is_answered and peer is not None and peer.failures > 0
+
+    def next_at(self) -> float:
+        """Return the time (in s) of the next step, including the pause that the drive needs."""
+        peer = self._peers.get(self.drive)
+        return max(self.due, peer.ready_ns / 1e9) if peer else self.due
 
     def _carry_out(self, step: Step, do: Do) -> bool:
         """Carry out a step, and pass its result to the script; return False if there was no good reply."""
@@ -222,6 +236,7 @@ class StopAttempt:
         if not isinstance(step, Write):
             return
         self._shows_more_than_zeros = self._is_read = False
+        self._is_answered = not isinstance(failure, UNANSWERED)
         if not isinstance(failure, UNSENT):
             self.times_sent += 1
             if isinstance(step, Pulse):
@@ -380,7 +395,7 @@ class StopRun:
         if not self.attempts and self._drives:
             begun, limit = _now(), _limit(self._seconds)
             self.attempts = [
-                StopAttempt(drive, partial(self._make, drive), begun, limit, partial(stopper.ready, drive))
+                StopAttempt(drive, partial(self._make, drive), begun, limit, stopper.peers)
                 for drive in self._drives
             ]
             stopper.records.note_stops_called(self._verb, self._drives)
@@ -448,6 +463,7 @@ class Stopper:
         self.records = writer.records
         self.under_way: dict[StopRun, list[StopAttempt]] = {}
         self._regain_ns = 0  # earliest time of the next attempt to reopen the port
+        self.peers = exchanges.peers.present
         self._exchanges = exchanges
         self._writer = writer
 
@@ -482,7 +498,7 @@ class Stopper:
 
     def _carry_out(self, stop: StopAttempt, step: Step) -> Any:
         if isinstance(step, Read):  # a read has one attempt: without a reply, the stop is sent again instead
-            return self._exchanges.value(stop.drive, step.register, 1)
+            return self._exchanges.value(stop.drive, step.register, 1, is_stop_read=True)
         assert isinstance(step, Write)
         timeout = WRITE_TIMEOUT if stop.is_sent else 0.0
         try:
@@ -493,20 +509,12 @@ class Stopper:
     def insist(self, drive: Drive, step: Write) -> Outcome:
         """Send a stop, or another write that is harmless at any time; first reopen a lost port."""
         checked: Checked = set()
-
-        def write() -> Outcome:
-            return self._writer.insist(drive, step, checked)
-
+        write = partial(self._writer.insist, drive, step, checked)
         try:
             return self._on_open_port(write)
         # No other drives wait for their stops here, so the check is repeated at once.
         except CheckAgain:
             return self._on_open_port(write)
-
-    def ready(self, drive: Drive) -> float:
-        """Return the time (in s) before which no request may be sent to the drive."""
-        peer = self._exchanges.peers.present.get(drive)
-        return peer.ready_ns / 1e9 if peer else 0.0
 
     def _on_open_port(self, act: Callable[[], R]) -> R:
         """Reopen a lost port and carry out `act`. If the port is lost then, do both once more.
@@ -537,9 +545,16 @@ class Stopper:
             self._regain_ns = 0
 
 
-def _due(stop: StopAttempt) -> float:
-    """Return the time (in s) of the stop's next step, including the pause that its drive needs."""
-    return max(stop.due, stop.ready())
+def _next(stops: Sequence[StopAttempt], now: float) -> StopAttempt:
+    """Return the stop that is due first.
+
+    After a timeout of a silent drive, stops of drives that answer go first for as long as the timeout took.
+    Otherwise each of their reads would wait for the timeouts of all silent drives.
+    """
+    due = [stop for stop in stops if stop.next_at() <= now]
+    if now < max(stop.others_first_until for stop in stops):
+        due = [stop for stop in due if not stop.gives_way()] or due
+    return min(due or stops, key=lambda stop: stop.next_at())
 
 
 def _now() -> float:
@@ -575,7 +590,7 @@ def stop_together(stops: Sequence[StopAttempt], do: Do, end: Callable[[StopAttem
     """
     waiting = [stop for stop in stops if not stop.is_over]
     while waiting:
-        stop = min(waiting, key=_due)  # the stop that is due first
+        stop = _next(waiting, _now())
         clock.sleep(max(0.0, stop.due - _now()))
         waiting.remove(stop)
         if stop.advance(do, _now):

@@ -315,7 +315,8 @@ class Exchange:
 
     Times are in seconds. `character` is the duration of one character. `silence` precedes the request and
     follows its reply, `turnaround` follows a broadcast. `period` is the period of the exchange's slots (0: it
-    has no slots). With `insists` the request is sent even if a late reply could be mistaken for its own.
+    has no slots). With `insists` the request is sent even if a late reply could be mistaken for its own. With
+    `is_stop_read` the request is a read of a stop, and may precede stops of silent drives.
     `timeout` is the least timeout; 0 means the learnt one. `answer` is the least and the greatest raw value
     of the only register in the reply. `block` has the fields for rows, `values` those for the caller of
     `Port.carry_out`. The `echo_probe` is sent first while it is unknown whether the adapter echoes; its reply
@@ -349,6 +350,7 @@ class Exchange:
         turnaround: float = 0.1,
         period: float = 0.0,
         insists: bool = False,
+        is_stop_read: bool = False,
         timeout: float = 0.0,
         answer: tuple[int, int] | None = None,
         block: RowLayout | None = None,
@@ -381,6 +383,7 @@ class Exchange:
             "turnaround_ns": round(turnaround * 1e9),
             "period_ns": round(period * 1e9),
             "insists": insists,
+            "is_stop_read": is_stop_read,
             "timeout_ns": round(timeout * 1e9),
             "least": least,
             "end": most + 1,

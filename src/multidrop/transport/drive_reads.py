@@ -115,10 +115,9 @@ class PreparedRead:
         self.whole = decoder.count if decoder.is_plain else None  # number of values in a complete reply
         self.spare: list[Completion] = []  # completions that later reads reuse
 
-    def insisting(self, drive: Drive, timeout: float) -> Exchange:
-        """Return an exchange that reads the block without waiting for late replies; `timeout` is in s."""
-        peer, values = self.exchange.peer, self.exchange.values
-        return make_read(drive, self.block, peer, values=values, insists=True, timeout=timeout)
+    def special(self, drive: Drive, details: dict[str, Any]) -> Exchange:
+        """Return another exchange that reads the block; `details` are arguments of Exchange."""
+        return make_read(drive, self.block, self.exchange.peer, values=self.exchange.values, **details)
 
 
 class ReadPlan:

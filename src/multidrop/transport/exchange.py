@@ -168,9 +168,7 @@ class Exchanges:
         drive: Drive,
         registers: Sequence[Register[Any] | Text | str],
         attempts: int = READ_ATTEMPTS,
-        *,
-        insists: bool = False,
-        timeout: float = 0.0,
+        **details: Any,
     ) -> dict[str, Any]:
         """Return the values of the registers (Register objects or names), by name.
 
@@ -178,8 +176,9 @@ class Exchanges:
         drive does not answer a whole block, its parts are read instead, also by later calls until the port is
         reopened.
 
-        With `insists`, each request is sent immediately, even if a late reply could be mistaken for its
-        reply. On a slow connection, such a request waits up to `timeout` seconds for its reply.
+        `details` are arguments of Exchange. With `insists`, each request is sent immediately, even if a late
+        reply could be mistaken for its reply. On a slow connection, such a request waits up to `timeout`
+        seconds for its reply.
 
         Raises NoValue if a register holds no valid value, and TextWanted if one of `registers` is a text.
         """
@@ -193,7 +192,7 @@ class Exchanges:
             read = wanted.pop()
             parts = prepared.parts.get(read.block) if prepared.parts else None
             if parts is None:
-                exchange = read.insisting(drive, timeout) if insists else read.exchange
+                exchange = read.special(drive, details) if details else read.exchange
                 try:
                     into = read.spare.pop()
                 except IndexError:
@@ -256,22 +255,19 @@ class Exchanges:
         drive: Drive,
         register: Register[Any] | Text,
         attempts: int = READ_ATTEMPTS,
-        *,
-        insists: bool = False,
+        **details: Any,
     ) -> Any:
         if isinstance(register, Text):
-            return self.text(drive, register, attempts, insists=insists)
-        return self.values(drive, [register], attempts, insists=insists)[register.name]
+            return self.text(drive, register, attempts, **details)
+        return self.values(drive, [register], attempts, **details)[register.name]
 
-    def text(self, drive: Drive, text: Text, attempts: int = READ_ATTEMPTS, *, insists: bool = False) -> str:
+    def text(self, drive: Drive, text: Text, attempts: int = READ_ATTEMPTS, **details: Any) -> str:
         """Return a text. If it is longer than the family's limit for one read, several requests read it."""
-        reads = (self._read_block(drive, block, attempts, insists) for block in text_blocks(drive, text))
+        reads = (self._read_block(drive, block, attempts, **details) for block in text_blocks(drive, text))
         return text.decode(b"".join(reads))
 
-    def _read_block(
-        self, drive: Drive, block: Block, attempts: int = READ_ATTEMPTS, insists: bool = False
-    ) -> bytes:
-        read = make_read(drive, block, self.peers.of(drive), insists=insists)
+    def _read_block(self, drive: Drive, block: Block, attempts: int = READ_ATTEMPTS, **details: Any) -> bytes:
+        read = make_read(drive, block, self.peers.of(drive), **details)
         return self._ask(drive, read, attempts).data
 
     def _prepare(self, drive: Drive) -> PreparedReads:
@@ -295,7 +291,7 @@ class Exchanges:
             return register.decode(b"".join(self._ask(drive, read, 1).data for read in asked))
         (block,) = blocks(other, [register])
         read = PreparedRead(other, block, self.peers.of(drive))
-        found = read.decode(self._ask(drive, read.insisting(other, 0.0), 1))
+        found = read.decode(self._ask(drive, read.special(other, {"insists": True}), 1))
         if None in found.values():
             raise no_value(drive, found)
         return found[register.name]

