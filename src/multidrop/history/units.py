@@ -11,6 +11,7 @@ from datetime import UTC, datetime, timedelta
 from typing import Any, NamedTuple
 
 from multidrop.printable import is_whole
+from multidrop.recording.format import described_registers, tables_in
 
 Series = tuple[str, str]  # drive and register
 Moment = int | datetime
@@ -30,12 +31,7 @@ FileUnits = Mapping[Series, Sequence[SeriesUnit]]  # each series' units in one f
 
 def units_by_series(metadata: object) -> dict[Series, SeriesUnit]:
     """Return the units of all series that a segment's metadata describes."""
-    return {
-        (drive, register): _unit_in(about)
-        for drive, described in _table(_table(metadata).get("drives")).items()
-        for register, about in _table(_table(described).get("registers")).items()
-        if isinstance(about, dict)
-    }
+    return {(drive, name): _unit_in(about) for drive, name, about in described_registers(metadata)}
 
 
 def file_units_of(metadata: object) -> FileUnits:
@@ -46,9 +42,9 @@ def file_units_of(metadata: object) -> FileUnits:
 def unit_texts_of(metadata: object) -> dict[Series, str]:
     """Return each series' text for the column `unit` of Parquet files and of messages to `multidrop hub`."""
     found = {}
-    drives = _table(_table(metadata).get("drives"))
+    models = {drive: about.get("model") for drive, about in tables_in(metadata, "drives")}
     for (drive, register), unit in units_by_series(metadata).items():
-        model = _table(drives.get(drive)).get("model") if unit.text == NAMED else None
+        model = models[drive] if unit.text == NAMED else None
         found[drive, register] = f"{NAMED} of {model}" if model else unit.text
     return found
 
@@ -145,7 +141,7 @@ class UnitHistory:
     def described(self, metadata: Mapping[str, Any]) -> dict[str, Any]:
         """Return the metadata with the units of all registers, including columns such as "load [A]"."""
         columns = {series: (series[1], unit) for series, unit in self.newest.items()}
-        drives = {name: dict(_table(about)) for name, about in _table(metadata.get("drives")).items()}
+        drives = {name: dict(about) for name, about in tables_in(metadata, "drives")}
         said = units_by_series(metadata)
         for (drive, _), (column, unit) in [
             *columns.items(),

@@ -159,18 +159,8 @@ class RecordingReader(ArrowTable):
         see `WideRows`. Raises ValueError for a column that is not in the recording, or if the recording is
         damaged.
         """
-        return WideRows((row for rows in self for row in rows), columns, self._registers())
-
-    def _registers(self) -> list[str]:
-        """Return the wide form's column names for all polled registers."""
-        drives = self.metadata.get("drives")
-        described = drives.items() if isinstance(drives, dict) else ()
-        return [
-            f"{drive}.{register}"
-            for drive, about in described
-            if isinstance(about, dict) and isinstance(about.get("registers"), dict)
-            for register in about["registers"]
-        ]
+        known = [f"{drive}.{register}" for drive, register, _ in described_registers(self.metadata)]
+        return WideRows((row for rows in self for row in rows), columns, known)
 
     def _damaged(self, rows: int, error: Exception | str) -> ValueError:
         """Return a ValueError that describes the damage and states how many rows before it are readable."""
@@ -191,6 +181,20 @@ class RecordingReader(ArrowTable):
         if not isinstance(metadata, dict):
             raise self._not_a_recording("its metadata is not a JSON object", path)
         return metadata
+
+
+def described_registers(metadata: object) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
+    """Yield drive, name and description of each register in the metadata, without invalid entries."""
+    for drive, about in tables_in(metadata, "drives"):
+        for register, described in tables_in(about, "registers"):
+            yield drive, register, described
+
+
+def tables_in(table: object, key: str) -> list[tuple[str, dict[str, Any]]]:
+    """Return the tables in `table[key]` with their names, without invalid entries."""
+    found = table.get(key) if isinstance(table, dict) else None
+    entries = found.items() if isinstance(found, dict) else ()
+    return [(name, entry) for name, entry in entries if isinstance(entry, dict)]
 
 
 def dump_metadata(metadata: Metadata) -> str:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from multidrop.polling.added_rows import EVENT, TRIGGER
 from multidrop.polling.batch import ROW_COLUMNS, Rows
 from multidrop.printable import is_whole
-from multidrop.recording.format import Metadata, RecordingWriter, writing
+from multidrop.recording.format import Metadata, RecordingWriter, tables_in, writing
 
 LONGEST_NAME = 4096  # limit of a name's length in bytes
 LARGEST_COUNT = 2**53  # largest count that a float64 holds exactly
@@ -72,19 +72,13 @@ def rows_by_series(drive: Array, register: Array, time: Array) -> list[Array]:
 # ---- metadata ----
 
 
-def checked_drives(drives: object) -> dict[str, Any]:
+def checked_drives(metadata: object) -> dict[str, Any]:
     """Return the metadata of drives and registers without invalid entries."""
     found = {}
-    for name, about in _tables(drives):
-        registers = {register: _checked(table) for register, table in _tables(about.get("registers"))}
+    for name, about in tables_in(metadata, "drives"):
+        registers = {register: _checked(table) for register, table in tables_in(about, "registers")}
         found[name] = {**about, "registers": registers}
     return found
-
-
-def _tables(tables: object) -> list[tuple[str, dict[str, Any]]]:
-    if not isinstance(tables, dict):
-        return []
-    return [(name, table) for name, table in tables.items() if isinstance(table, dict)]
 
 
 def _checked(register: dict[str, Any]) -> dict[str, Any]:
@@ -151,7 +145,7 @@ class SeriesWriter(RecordingWriter):
 
     def __init__(self, path: Path, metadata: Metadata) -> None:
         super().__init__(path)
-        self.drives = checked_drives(metadata.get("drives"))
+        self.drives = checked_drives(metadata)
         self._thread = ThreadPoolExecutor(1, "multidrop export")
         self._thread.submit(int)  # start the thread before a file exists, in case Ctrl-C interrupts the start
         self._codes: dict[str, dict[str, int]] = {"drive": {}, "register": {}, "status": {}}

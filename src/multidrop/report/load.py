@@ -237,7 +237,7 @@ def load(path: str | Path) -> Recording:
     )
     if not 0 <= time.min() <= time.max() < LATEST_NS:
         raise ValueError(f"{path} cannot be drawn: it has rows from before 1970 or after 2200")
-    metadata = {**reader.metadata, "drives": checked_drives(reader.metadata.get("drives"))}
+    metadata = {**reader.metadata, "drives": checked_drives(reader.metadata)}
     drives, registers, statuses = map(tuple, codes.values())
     series = []
     for rows_of in sorted(rows_by_series(drive, register, time), key=np.min):
