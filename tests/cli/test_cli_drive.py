@@ -231,21 +231,6 @@ def test_set_frequency_prints_the_setpoint_in_the_registers_unit(run: Run) -> No
     assert "set-frequency done at setpoint = 24.69 %;" in out
 
 
-def test_the_commands_start_stop_and_set_frequency_write_to_the_drive(
-    run: Run, port: str, toy: SimulatedDrive
-) -> None:
-    assert run("start", port, TOY, 1, "--direction", "reverse", "--yes") == (
-        0,
-        f"toy@1: start done; state: running; {DOG}\n",
-        "",
-    )
-    assert toy["control"] == 3
-    assert run("set-frequency", port, TOY, 1, "33.5", "--yes")[0] == 0
-    assert toy["frequency"] == 33.5
-    assert run("stop", port, TOY, 1)[0] == 0  # a stop needs no confirmation
-    assert toy["control"] == 0
-
-
 @pytest.mark.slow
 def test_start_needs_a_frequency_if_the_setpoint_is_unreadable(run: Run) -> None:
     """A command does not know the setpoint that an earlier command has written."""

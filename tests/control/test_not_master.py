@@ -454,10 +454,3 @@ def test_pyserial_ports_cannot_be_used_with_a_mastership(port: str) -> None:
 def test_a_mastership_of_another_type_raises_type_error() -> None:
     with pytest.raises(TypeError, match=r"^mastership takes a multidrop\.core\.Mastership, not 0\.7$"):
         Bus("/dev/null", mastership=0.7)  # type: ignore[arg-type]
-
-
-def test_a_bus_without_a_mastership_argument_sends_normally(scene: Scene) -> None:
-    path = scene.simulator.wires[0].path
-    scene.bus.close()
-    with Bus(path) as bus:
-        assert bus.attach(Brief(1)).read(Toy.output_current) == 0.0

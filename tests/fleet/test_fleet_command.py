@@ -311,7 +311,7 @@ def test_a_nats_server_version_is_parsed(tmp_path: Path, said: str, version: tup
 def test_the_error_about_a_missing_nats_server_says_where_to_get_it(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(demo, "_programs", lambda: iter(["/nowhere/nats-server"]))
+    monkeypatch.setattr(demo, "server_programs", lambda: iter(["/nowhere/nats-server"]))
     status, out, err = run("fleet", "demo")
     assert (status, out) == (2, "")
     assert err == (

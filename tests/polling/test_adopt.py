@@ -237,6 +237,9 @@ def test_a_line_is_added_polled_and_removed() -> None:
         assert list(made.poller.statistics()) == ["hall"]
         with pytest.raises(ValueError, match="there is no line 'yard'; there are hall"):
             made.poller.remove_line("yard")
+        with pytest.raises(PlantError, match=r'^line "hall": another line already has this name[^\n]*$'):
+            made.poller.add_line(replace(yard(toy("fan-3", 3)), name="hall"))
+        assert list(made.poller.buses) == ["hall"]
         made.poller.add_line(yard(toy("fan-1", 3)))
         made.run(1)
         rows = made.run(5)

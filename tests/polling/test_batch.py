@@ -9,7 +9,7 @@ import importlib
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -59,18 +59,12 @@ def test_a_list_of_wide_table_columns_raises_type_error() -> None:
         example().wide(cast(Any, ["pump-1.speed"]))
 
 
-def test_pyarrow_reads_a_batch() -> None:
-    found = pa.record_batch(example())
+@pytest.mark.parametrize("read", [pa.record_batch, pa.table])
+def test_pyarrow_reads_the_rows_and_the_schema_of_a_batch(read: Callable[[Batch], Any]) -> None:
+    found = read(example())
     found.validate(full=True)
     assert found.schema.equals(SCHEMA)
     assert rows_of(found) == EXAMPLE
-
-
-@pytest.mark.slow
-def test_pyarrow_reads_the_rows_and_the_schema_of_a_batch() -> None:
-    table = pa.table(example())
-    assert table.schema.equals(SCHEMA)
-    assert rows_of(table) == EXAMPLE
     assert pa.schema(example()).equals(SCHEMA)
 
 
@@ -78,33 +72,6 @@ def test_arrow_data_stays_valid_after_the_batch_is_deleted() -> None:
     kept = [pa.record_batch(counting(100, start)) for start in range(0, 2000, 100)]
     values = [row.value for part in kept for row in rows_of(part)]
     assert values == [None if at % 10 == 9 else at for at in range(2000)]
-
-
-def test_arrow_shares_the_memory_of_a_batch() -> None:
-    columns = Columns(1)
-    assert add_rows(columns, block(0, 0), completion(1, first_ns=2, words=(100,)), 0)
-    taken = pa.record_batch(Batch(columns, Names("a"), Names("b")))
-    columns.c.value[0] = 7.5
-    assert taken.column("value")[0].as_py() == 7.5
-
-
-@pytest.mark.slow
-def test_polars_reads_a_batch() -> None:
-    polars = pytest.importorskip("polars", reason="needs polars")
-    frame = polars.DataFrame(example())
-    assert frame.schema["time"] == polars.Datetime("ns", "UTC")
-    times = frame["time"].to_physical()
-    assert [Row(*row) for row in frame.with_columns(time=times).iter_rows()] == EXAMPLE
-
-
-def test_pandas_reads_a_batch() -> None:
-    pandas = pytest.importorskip("pandas", reason="needs pandas")
-    frame = pandas.DataFrame.from_arrow(example())
-    assert str(frame["time"].dtype) == "datetime64[ns, UTC]"
-    assert [time.value for time in frame["time"]] == [row.time_ns for row in EXAMPLE]
-    assert list(frame["drive"]) == [row.drive for row in EXAMPLE]
-    assert list(frame["value"].isna()) == [row.value is None for row in EXAMPLE]
-    assert list(frame["value"].dropna()) == [49.99, 0.3]
 
 
 @pytest.mark.parametrize("library", ["pandas", "numpy"])
@@ -353,13 +320,16 @@ def test_arrow_libraries_read_all_values_and_missing_values() -> None:
 @pytest.mark.slow
 def test_arrow_libraries_do_not_copy_numeric_columns() -> None:
     """No library copies the columns `value` and `monotonic_ns`. Only the names are created for Arrow."""
+
+    def address(batch: Batch, name: str) -> int:
+        return int(pa.py_buffer(getattr(batch.columns(), name)).address)
+
+    pairs = [(batch, name) for batch in polled_batches() for name in ("value", "monotonic_ns")]
+    for batch, name in pairs:
+        assert pa.record_batch(batch).column(name).buffers()[1].address == address(batch, name)
     polars = pytest.importorskip("polars", reason="needs polars")
-    for batch in polled_batches():
-        columns, frame = batch.columns(), polars.DataFrame(batch)
-        for name in ("value", "monotonic_ns"):
-            address = pa.py_buffer(getattr(columns, name)).address
-            assert pa.record_batch(batch).column(name).buffers()[1].address == address
-            assert frame[name].to_arrow().buffers()[1].address == address
+    for batch, name in pairs:
+        assert polars.DataFrame(batch)[name].to_arrow().buffers()[1].address == address(batch, name)
 
 
 PUMP = "pump-1.output_frequency"
@@ -367,19 +337,21 @@ SPEED = "pump-1.motor_speed"
 
 
 @pytest.mark.slow
-def test_pandas_gets_times_as_datetime64_in_utc() -> None:
-    pytest.importorskip("pandas", reason="needs pandas")
-    frame = example().to_pandas()
+@pytest.mark.parametrize("by_method", [False, True])
+def test_pandas_reads_a_batch_with_times_as_datetime64_in_utc(by_method: bool) -> None:
+    pandas = pytest.importorskip("pandas", reason="needs pandas")
+    frame = example().to_pandas() if by_method else pandas.DataFrame.from_arrow(example())
     assert list(frame.columns) == list(ROW_COLUMNS)
     assert str(frame["time"].dtype) == "datetime64[ns, UTC]"
     assert [time.value for time in frame["time"]] == [row.time_ns for row in EXAMPLE]
+    assert list(frame["drive"]) == [row.drive for row in EXAMPLE]
     assert list(frame["value"].isna()) == [row.value is None for row in EXAMPLE]
     assert list(frame["value"].dropna()) == [49.99, 0.3]
     assert list(frame["status"]) == [row.status for row in EXAMPLE]
 
 
 @pytest.mark.slow
-def test_polars_gets_times_as_datetime_in_utc() -> None:
+def test_polars_reads_a_batch_with_times_as_datetime_in_utc() -> None:
     polars = pytest.importorskip("polars", reason="needs polars")
     frame = example().to_polars()
     assert frame.schema["time"] == polars.Datetime("ns", "UTC")

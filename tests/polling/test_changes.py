@@ -19,7 +19,6 @@ from lines import line, plant, polled, rows_of, until
 from toy import Picky, Toy
 
 from multidrop.bus import Bus
-from multidrop.errors import NoReply
 from multidrop.families import YD1000, InvtCHE
 from multidrop.plant.loader import load_plant
 from multidrop.plant.model import PolledDrive
@@ -152,19 +151,6 @@ def test_every_call_of_a_detached_drive_raises_and_sends_nothing(port: str) -> N
         again = bus.attach(Toy, address=1, name="pump-1")
         assert bus.peer(again) is peer  # the core's record, which knows the late replies that may come
         assert peer.proofs is proofs  # the core may still be using them
-
-
-@pytest.mark.slow
-def test_a_drive_at_a_reused_address_expects_the_old_drives_late_replies(port: str) -> None:
-    with Bus(port) as bus:
-        gone = bus.attach(Toy, address=9)
-        with pytest.raises(NoReply):
-            gone.read(CURRENT)
-        due_ns = bus.peer(gone).late_until_ns
-        assert due_ns > 0
-        bus.detach(gone)
-        new = bus.attach(InvtCHE, address=9)
-        assert bus.peer(new).late_until_ns == due_ns
 
 
 def test_no_drive_is_detached_during_stop_all(port: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -24,7 +24,6 @@ from toy import QuickToy, Toy
 from multidrop import Bus, NotMaster
 from multidrop.core import Mastership, RowQueue
 from multidrop.errors import NoSuchPort
-from multidrop.plant.loader import PlantError
 from multidrop.plant.model import PlantLine, PolledDrive
 from multidrop.poller import Poller
 from multidrop.polling import line_set
@@ -321,21 +320,6 @@ def test_an_added_or_removed_line_does_not_interrupt_others(mastership: Mastersh
         assert {row.status for row in rows} <= {"ok", *HOST_LATE}
         due = [row.monotonic_ns for row in rows]
         assert max(later - at for at, later in pairwise(due)) < S  # far more than the period, 0.02 s
-
-
-@pytest.mark.slow
-def test_a_duplicate_or_unknown_line_name_raises_a_one_sentence_error(mastership: Mastership) -> None:
-    hold(mastership)
-    with lines(None) as (_, (hall, yard)), Poller(plant(hall), mastership=mastership) as poller:
-        again = line(yard.port, quick("fan", 2, None), name="hall")
-        with pytest.raises(PlantError) as mistake:
-            poller.add_line(again)
-        assert str(mistake.value).count("\n") == 0
-        assert "hall" in str(mistake.value)
-        with pytest.raises(ValueError, match=r"^there is no line 'yard'; there are hall$"):
-            poller.remove_line("yard")
-        assert list(poller.buses) == ["hall"]
-        Rows(poller).settle("pump")
 
 
 @pytest.mark.slow

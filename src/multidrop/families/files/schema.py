@@ -373,7 +373,7 @@ def _facts(tables: Sequence[str]) -> dict[str, Any]:
         "properties": {"framings": {"contains": {"enum": ["ascii", "ASCII"]}}},
     }
     rtu_only = {"formats": {"anyOf": [eight_bits, _table({"rtu": eight_bits})]}}
-    both = {"formats": {"properties": {"rtu": eight_bits}}}
+    both = {"formats": {"properties": {"rtu": eight_bits}, "required": ["ascii"]}}
     facts = json_schema(
         FAMILY_KEYS,
         allOf=[

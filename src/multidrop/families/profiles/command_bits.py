@@ -43,14 +43,8 @@ class CiA402Status(IntFlag):
     NO_QUICK_STOP = 1 << 5
     SWITCH_ON_DISABLED = 1 << 6
     WARNING = 1 << 7
-    BIT_8 = 1 << 8
     REMOTE = 1 << 9
     AT_REFERENCE = 1 << 10
-    BIT_11 = 1 << 11
-    BIT_12 = 1 << 12
-    BIT_13 = 1 << 13
-    BIT_14 = 1 << 14
-    BIT_15 = 1 << 15
 
 
 # control words that lead to "operation enabled", in this order
@@ -78,6 +72,8 @@ class CiA402(Profile):
     stop_word: ClassVar[int] = SWITCH_ON
     coast_word: ClassVar[int] = 0x0000
     reset_word: ClassVar[int] = 0x0087
+    trip_bits: ClassVar[int] = CiA402Status.FAULT
+    running_bits: ClassVar[int] = CiA402Status.OPERATION_ENABLED
     roles = {
         **COMMON,
         "control": Role(
@@ -95,12 +91,6 @@ class CiA402(Profile):
             return ""
         known = status & MASK in (READY, SWITCHED_ON, ENABLED, QUICK_STOP)
         return "" if known else "this is not a state of CiA 402"
-
-    def _is_tripped(self, status: int) -> bool:
-        return bool(status & CiA402Status.FAULT)
-
-    def _turns(self, status: int) -> bool:
-        return bool(status & CiA402Status.OPERATION_ENABLED)
 
     def _condition(self, status: int) -> Condition:
         return Condition.DECELERATING if status & MASK == QUICK_STOP else super()._condition(status)
@@ -165,12 +155,6 @@ class ProfidriveStatus(IntFlag):
     ALARM = 1 << 7
     AT_SETPOINT = 1 << 8
     REMOTE = 1 << 9
-    BIT_10 = 1 << 10
-    BIT_11 = 1 << 11
-    BIT_12 = 1 << 12
-    BIT_13 = 1 << 13
-    BIT_14 = 1 << 14
-    BIT_15 = 1 << 15
 
 
 OFF, ON, START = 0x0476, 0x0477, 0x047F  # OFF and ON do not turn the motor: they do not enable operation
@@ -194,6 +178,8 @@ class Profidrive(Profile):
     stop_word: ClassVar[int] = 0x047E
     coast_word: ClassVar[int] = 0x047C
     reset_word: ClassVar[int] = 0x04FE
+    trip_bits: ClassVar[int] = ProfidriveStatus.TRIPPED
+    running_bits: ClassVar[int] = ProfidriveStatus.OPERATION_ENABLED
     roles = {
         **COMMON,
         "control": Role(
@@ -212,12 +198,6 @@ class Profidrive(Profile):
         if status & ProfidriveStatus.READY_TO_OPERATE and not status & ProfidriveStatus.READY_TO_SWITCH_ON:
             return "this would be ready to operate but not to switch on"
         return ""
-
-    def _is_tripped(self, status: int) -> bool:
-        return bool(status & ProfidriveStatus.TRIPPED)
-
-    def _turns(self, status: int) -> bool:
-        return bool(status & ProfidriveStatus.OPERATION_ENABLED)
 
     def _condition(self, status: int) -> Condition:
         if self._turns(status) and not status & ProfidriveStatus.READY_TO_OPERATE:
@@ -290,14 +270,12 @@ class DanfossStatus(IntFlag):
     NOT_COASTING = 1 << 2  # on an FC 101 this bit means "safety closed"
     TRIPPED = 1 << 3
     ERROR = 1 << 4
-    BIT_5 = 1 << 5
     TRIP_LOCKED = 1 << 6  # not used on an FC 101
     WARNING = 1 << 7
     AT_REFERENCE = 1 << 8
     BY_LINE = 1 << 9  # 1 in auto mode, in which the line commands the drive; 0 in hand mode
     IN_RANGE = 1 << 10
     RUNNING = 1 << 11
-    BIT_12 = 1 << 12
     VOLTAGE_WARNING = 1 << 13
     CURRENT_LIMIT = 1 << 14
     THERMAL_WARNING = 1 << 15
@@ -320,6 +298,8 @@ class DanfossFC(Profile):
     coast_word: ClassVar[int] = 0x0434
     reset_word: ClassVar[int] = 0x04BC
     start_word: ClassVar[int] = 0x047C
+    trip_bits: ClassVar[int] = DanfossStatus.TRIPPED | DanfossStatus.TRIP_LOCKED
+    running_bits: ClassVar[int] = DanfossStatus.RUNNING
     roles = {
         **COMMON,
         "control": Role(
@@ -335,12 +315,6 @@ class DanfossFC(Profile):
         if status & DanfossStatus.RUNNING and status & DanfossStatus.TRIPPED:
             return "this would be both running and tripped"
         return ""
-
-    def _is_tripped(self, status: int) -> bool:
-        return bool(status & (DanfossStatus.TRIPPED | DanfossStatus.TRIP_LOCKED))
-
-    def _turns(self, status: int) -> bool:
-        return bool(status & DanfossStatus.RUNNING)
 
     def _not_ready(self, status: int) -> str:
         if not status & DanfossStatus.BY_LINE:
@@ -378,20 +352,8 @@ class OptidriveStatus(IntFlag):
 
     RUNNING = 1 << 0
     TRIPPED = 1 << 1
-    BIT_2 = 1 << 2
-    BIT_3 = 1 << 3
-    BIT_4 = 1 << 4
     STANDBY = 1 << 5
     READY = 1 << 6
-    BIT_7 = 1 << 7
-    CODE_0 = 1 << 8
-    CODE_1 = 1 << 9
-    CODE_2 = 1 << 10
-    CODE_3 = 1 << 11
-    CODE_4 = 1 << 12
-    CODE_5 = 1 << 13
-    CODE_6 = 1 << 14
-    CODE_7 = 1 << 15
 
 
 OPTIDRIVE_RESERVED = 0x9C  # bits 2, 3, 4 and 7 of the low byte
@@ -415,6 +377,8 @@ class Optidrive(Profile):
     coast_word: ClassVar[int] = 0x0008
     reset_word: ClassVar[int] = 0x0004
     start_word: ClassVar[int] = 0x0001
+    trip_bits: ClassVar[int] = OptidriveStatus.TRIPPED
+    running_bits: ClassVar[int] = OptidriveStatus.RUNNING
     roles = {
         **COMMON,
         "control": Role(
@@ -429,16 +393,10 @@ class Optidrive(Profile):
     def _impossible(self, status: int) -> str:
         return "its reserved bits are set" if status & OPTIDRIVE_RESERVED else ""
 
-    def _is_tripped(self, status: int) -> bool:
-        return bool(status & OptidriveStatus.TRIPPED)
-
     def _fault(self) -> Script[str]:
         """Return the trip code in the status's high byte, named if the family has a register `fault`."""
         named = yield from super()._fault()
         return named or f"code {(yield from self._status()) >> 8}"
-
-    def _turns(self, status: int) -> bool:
-        return bool(status & OptidriveStatus.RUNNING)
 
     def _not_ready(self, status: int) -> str:
         return "" if status & (OptidriveStatus.READY | OptidriveStatus.RUNNING) else "is not ready to run"
@@ -476,9 +434,6 @@ class YaskawaStatus(IntFlag):
     PARAMETER_ERROR = 1 << 8
     POWER_LOSS = 1 << 9
     SECOND_MOTOR = 1 << 10
-    BIT_11 = 1 << 11
-    BIT_12 = 1 << 12
-    BIT_13 = 1 << 13
     REFERENCE_BY_LINE = 1 << 14
     COMMANDED_BY_LINE = 1 << 15
 
@@ -497,6 +452,8 @@ class Yaskawa(Profile):
 
     stop_word: ClassVar[int] = 0
     reset_word: ClassVar[int] = YaskawaControl.RESET
+    trip_bits: ClassVar[int] = YaskawaStatus.FAULT
+    running_bits: ClassVar[int] = YaskawaStatus.RUNS
     roles = {
         **COMMON,
         "control": Role(
@@ -516,12 +473,6 @@ class Yaskawa(Profile):
         if status & YaskawaStatus.RUNS and status & YaskawaStatus.FAULT:
             return "this would be both running and in a fault"
         return "" if status else "no bit is set"
-
-    def _is_tripped(self, status: int) -> bool:
-        return bool(status & YaskawaStatus.FAULT)
-
-    def _turns(self, status: int) -> bool:
-        return bool(status & YaskawaStatus.RUNS)
 
     def _not_ready(self, status: int) -> str:
         if not status & YaskawaStatus.COMMANDED_BY_LINE:

@@ -52,17 +52,11 @@ class DeltaStatus(IntFlag):
     JOGS = 1 << 2
     REVERSE_LAMP_0 = 1 << 3
     REVERSE_LAMP_1 = 1 << 4
-    BIT_5 = 1 << 5
-    BIT_6 = 1 << 6
-    BIT_7 = 1 << 7
     REFERENCE_BY_LINE = 1 << 8
     REFERENCE_BY_TERMINAL = 1 << 9
     COMMANDED_BY_LINE = 1 << 10
     LOCKED = 1 << 11
     COPIES = 1 << 12
-    BIT_13 = 1 << 13
-    BIT_14 = 1 << 14
-    BIT_15 = 1 << 15
 
 
 # Valid numbers in bits 15 to 13 of Delta's status. On a C2000 Plus they are the control mode (p. A-10).
@@ -202,8 +196,9 @@ class Invt(Profile):
     def _impossible(self, status: int) -> str:
         return "" if status in tuple(cast(Any, self.status.values)) else "the profile has no such number"
 
-    def _is_tripped(self, status: int) -> bool:
+    def _tripped(self, status: int) -> Script[bool]:
         return status == InvtStatus.FAULT
+        yield
 
     def _turns(self, status: int) -> bool:
         return status not in (InvtStatus.STANDBY, InvtStatus.FAULT, InvtStatus.POWER_OFF)

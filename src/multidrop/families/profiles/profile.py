@@ -222,6 +222,9 @@ class Profile(Drive):
     coast_word: ClassVar[int | None] = None
     reset_word: ClassVar[int]
     reset_role: ClassVar[str] = "control"
+    # bits of the status of which at least one is set: in a fault, and while the motor has voltage
+    trip_bits: ClassVar[int]
+    running_bits: ClassVar[int]
 
     setpoint_name = "reference"
     options = {
@@ -274,12 +277,9 @@ class Profile(Drive):
         """Return why a drive of this profile cannot have this status; "" if it can."""
         return ""
 
-    def _is_tripped(self, status: int) -> bool:
-        raise NotImplementedError
-
     def _turns(self, status: int) -> bool:
         """Return True if the status shows that the motor has voltage."""
-        raise NotImplementedError
+        return bool(status & self.running_bits)
 
     def _not_ready(self, status: int) -> str:
         """Return why the drive cannot be started from the line; "" if it can be."""
@@ -322,7 +322,7 @@ class Profile(Drive):
 
     def _tripped(self, status: int) -> Script[bool]:
         """Return True if the drive has a fault; by default, the status shows this."""
-        return self._is_tripped(status)
+        return bool(status & self.trip_bits)
         yield
 
     def _is_at_rest(self) -> Script[bool]:
