@@ -74,6 +74,7 @@ class CiA402(Profile):
     reset_word: ClassVar[int] = 0x0087
     trip_bits: ClassVar[int] = CiA402Status.FAULT
     running_bits: ClassVar[int] = CiA402Status.OPERATION_ENABLED
+    needed_bits = ((CiA402Status.REMOTE, "does not take commands from the line"),)
     roles = {
         **COMMON,
         "control": Role(
@@ -94,9 +95,6 @@ class CiA402(Profile):
 
     def _condition(self, status: int) -> Condition:
         return Condition.DECELERATING if status & MASK == QUICK_STOP else super()._condition(status)
-
-    def _not_ready(self, status: int) -> str:
-        return "" if status & CiA402Status.REMOTE else "does not take commands from the line"
 
     def _start_word(self, direction: Direction | None, status: int) -> int:
         reverse = {member.name: int(member) for member in self.control.values or ()}.get("REVERSE", 0)
@@ -180,6 +178,7 @@ class Profidrive(Profile):
     reset_word: ClassVar[int] = 0x04FE
     trip_bits: ClassVar[int] = ProfidriveStatus.TRIPPED
     running_bits: ClassVar[int] = ProfidriveStatus.OPERATION_ENABLED
+    needed_bits = ((ProfidriveStatus.REMOTE, "is in local control"),)
     roles = {
         **COMMON,
         "control": Role(
@@ -203,9 +202,6 @@ class Profidrive(Profile):
         if self._turns(status) and not status & ProfidriveStatus.READY_TO_OPERATE:
             return Condition.DECELERATING  # OFF1 is in progress, a stop along the ramp
         return super()._condition(status)
-
-    def _not_ready(self, status: int) -> str:
-        return "" if status & ProfidriveStatus.REMOTE else "is in local control"
 
     def _start_word(self, direction: Direction | None, status: int) -> int:
         if direction is not None:
@@ -300,6 +296,11 @@ class DanfossFC(Profile):
     start_word: ClassVar[int] = 0x047C
     trip_bits: ClassVar[int] = DanfossStatus.TRIPPED | DanfossStatus.TRIP_LOCKED
     running_bits: ClassVar[int] = DanfossStatus.RUNNING
+    needed_bits = (
+        (DanfossStatus.BY_LINE, "is in hand mode, or was stopped on its keypad"),
+        (DanfossStatus.CONTROL_READY, "is not ready"),
+        (DanfossStatus.DRIVE_READY, "is not ready"),
+    )
     roles = {
         **COMMON,
         "control": Role(
@@ -314,13 +315,6 @@ class DanfossFC(Profile):
     def _impossible(self, status: int) -> str:
         if status & DanfossStatus.RUNNING and status & DanfossStatus.TRIPPED:
             return "this would be both running and tripped"
-        return ""
-
-    def _not_ready(self, status: int) -> str:
-        if not status & DanfossStatus.BY_LINE:
-            return "is in hand mode, or was stopped on its keypad"
-        if not status & DanfossStatus.CONTROL_READY or not status & DanfossStatus.DRIVE_READY:
-            return "is not ready"
         return ""
 
     def _cannot_reset(self, status: int) -> str:
@@ -379,6 +373,7 @@ class Optidrive(Profile):
     start_word: ClassVar[int] = 0x0001
     trip_bits: ClassVar[int] = OptidriveStatus.TRIPPED
     running_bits: ClassVar[int] = OptidriveStatus.RUNNING
+    needed_bits = ((OptidriveStatus.READY | OptidriveStatus.RUNNING, "is not ready to run"),)
     roles = {
         **COMMON,
         "control": Role(
@@ -397,9 +392,6 @@ class Optidrive(Profile):
         """Return the trip code in the status's high byte, named if the family has a register `fault`."""
         named = yield from super()._fault()
         return named or f"code {(yield from self._status()) >> 8}"
-
-    def _not_ready(self, status: int) -> str:
-        return "" if status & (OptidriveStatus.READY | OptidriveStatus.RUNNING) else "is not ready to run"
 
     def _start_word(self, direction: Direction | None, status: int) -> int:
         if direction is not None:
@@ -454,6 +446,10 @@ class Yaskawa(Profile):
     reset_word: ClassVar[int] = YaskawaControl.RESET
     trip_bits: ClassVar[int] = YaskawaStatus.FAULT
     running_bits: ClassVar[int] = YaskawaStatus.RUNS
+    needed_bits = (
+        (YaskawaStatus.COMMANDED_BY_LINE, "does not take commands from the line"),
+        (YaskawaStatus.READY | YaskawaStatus.RUNS, "is not ready"),
+    )
     roles = {
         **COMMON,
         "control": Role(
@@ -473,11 +469,6 @@ class Yaskawa(Profile):
         if status & YaskawaStatus.RUNS and status & YaskawaStatus.FAULT:
             return "this would be both running and in a fault"
         return "" if status else "no bit is set"
-
-    def _not_ready(self, status: int) -> str:
-        if not status & YaskawaStatus.COMMANDED_BY_LINE:
-            return "does not take commands from the line"
-        return "" if status & (YaskawaStatus.READY | YaskawaStatus.RUNS) else "is not ready"
 
     def _direction(self, status: int) -> Direction | None:
         return Direction.REVERSE if status & YaskawaStatus.REVERSE else Direction.FORWARD

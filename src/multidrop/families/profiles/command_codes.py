@@ -79,6 +79,7 @@ class Delta(Profile):
     stop_word: ClassVar[int] = DeltaControl.STOP
     reset_word: ClassVar[int] = DeltaReset.RESET
     reset_role: ClassVar[str] = "reset"
+    needed_bits = ((DeltaStatus.COMMANDED_BY_LINE, "does not take commands from the line"),)
     roles = {
         **COMMON,
         "control": Role((Access.COMMAND,), values=DeltaControl, harmless=(0, DeltaControl.STOP)),
@@ -106,9 +107,6 @@ class Delta(Profile):
 
     def _condition(self, status: int) -> Condition:
         return Condition.DECELERATING if status & 3 == STOPPING else super()._condition(status)
-
-    def _not_ready(self, status: int) -> str:
-        return "" if status & DeltaStatus.COMMANDED_BY_LINE else "does not take commands from the line"
 
     def _direction(self, status: int) -> Direction | None:
         shown = status >> 3 & 3

@@ -225,6 +225,8 @@ class Profile(Drive):
     # bits of the status of which at least one is set: in a fault, and while the motor has voltage
     trip_bits: ClassVar[int]
     running_bits: ClassVar[int]
+    # for a start, at least one bit of each entry must be set in the status; else its text says why not
+    needed_bits: ClassVar[tuple[tuple[int, str], ...]] = ()
 
     setpoint_name = "reference"
     options = {
@@ -283,7 +285,7 @@ class Profile(Drive):
 
     def _not_ready(self, status: int) -> str:
         """Return why the drive cannot be started from the line; "" if it can be."""
-        return ""
+        return next((why for bits, why in self.needed_bits if not status & bits), "")
 
     def _cannot_reset(self, status: int) -> str:
         """Return why a reset would have no effect or do harm; "" if it may be sent."""
