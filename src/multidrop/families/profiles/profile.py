@@ -446,10 +446,7 @@ class Profile(Drive):
                 raise
 
     def _watch_stop(self) -> Script[None]:
-        yield from self._stopped(self._is_at_rest, self._stop_limit())
-
-    def _stop_limit(self) -> float:
-        return self.option.get("stop_time", STOP_TIME)
+        yield from self._stopped(self._is_at_rest, self.option.get("stop_time", STOP_TIME))
 
     @verb
     def reset_fault(self) -> Script[None]:
