@@ -124,6 +124,7 @@ MAKES = (
         0x2000,
         _bit_1,
         ((Evidence.delixi_address, _own_address), (Evidence.delixi_baudrate, _delixi_baudrate)),
+        may_be_silent=True,  # its document names no exceptions
     ),
     Make(
         "invt-che",

@@ -136,6 +136,10 @@ class SimulatedDelixi(MotorDrive):
     def accepts_broadcast(self, request: Message) -> bool:
         return request.function == 0x06 and request.start == 0x2000  # only run commands may be broadcast
 
+    def accept(self, cell: MemoryCell, raw: int) -> int:
+        # the drive obeys the bits of every control word, also of words that this library never sends
+        return raw if cell.name == "control" else super().accept(cell, raw)
+
     def setpoint(self) -> float:
         by_line = self.word(DELIXI_FREQUENCY_SOURCE) == DELIXI_BY_LINE[DELIXI_FREQUENCY_SOURCE]
         return super().setpoint() if by_line else 0.0
