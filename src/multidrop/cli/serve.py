@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from multidrop.cli.support.arguments import add_port_option, plant_of
 from multidrop.cli.support.files import require_extra, write_new
-from multidrop.cli.support.log_thread import LogThread, add_log_argument, logging_to_stderr
+from multidrop.cli.support.log_thread import add_log_argument, logging_to_stderr
 from multidrop.cli.support.output import print_text, warn
 from multidrop.cli.support.signals import on_end_signals, on_reload_signal, run_loop
 from multidrop.cli.support.values import counted
@@ -83,8 +83,8 @@ def run(arguments: argparse.Namespace) -> int:
             warn(sentence)
         print_text(f"{plant.path}: no mistake found; {_url(settings, settings.port)}, parts: {parts}")
         return 0
-    with logging_to_stderr(arguments.log, _levels(logging.INFO)) as log:
-        return _serve(plant, settings, log, partial(_announce, settings), read)
+    with logging_to_stderr(arguments.log, _levels(logging.INFO)):
+        return _serve(plant, settings, partial(_announce, settings), read)
 
 
 def _write_modbus_map(plant: Plant, settings: ServeSettings, path: Path) -> int:
@@ -112,7 +112,7 @@ def serve_demo(*, is_shown: bool = True, log: str = "text") -> int:
         folder = Path(directory)
         path, faults = demo_files(folder)
         logged = logging_to_stderr(log, _levels(logging.WARNING))
-        with simulator(path, folder, faults), logged as log_thread, ExitStack() as stack:
+        with simulator(path, folder, faults), logged, ExitStack() as stack:
             plant = load_plant(path)
 
             def on_ready(gateway: Gateway) -> None:
@@ -122,7 +122,7 @@ def serve_demo(*, is_shown: bool = True, log: str = "text") -> int:
                 if is_shown:
                     threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
 
-            return _serve(plant, _demo_settings(plant, folder), log_thread, on_ready)
+            return _serve(plant, _demo_settings(plant, folder), on_ready)
 
 
 def blind_spots(plant: Plant) -> list[str]:
@@ -175,14 +175,12 @@ def _announce(settings: ServeSettings, gateway: Gateway) -> None:
 def _serve(
     plant: Plant,
     settings: ServeSettings,
-    log: LogThread,
     on_ready: Callable[[Gateway], None],
     read: Read | None = None,
 ) -> int:
     from dataclasses import replace
 
     from multidrop.gateway.gateway import Gateway
-    from multidrop.supervisor import supervisor
 
     try:
         gateway = Gateway(plant, settings, read=read)
@@ -196,7 +194,6 @@ def _serve(
         gateway.end()
 
     async def live() -> None:
-        supervisor().watch("log", log.is_alive)
         on_end_signals(end)
         if read:
             on_reload_signal(gateway.reload.begin, end)

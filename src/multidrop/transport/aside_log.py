@@ -32,9 +32,13 @@ class AsideThread:
         # and the timeout in s. None if no `flush` has timed out.
         self._late: tuple[SimpleQueue[None], float] | None = None
 
-    def put(self, work: Callable[[], object], most: int = MOST_WAITING) -> None:
-        """Queue this work unless `most` pieces are queued; return immediately. Work is done in order."""
-        if self._work.qsize() < most:
+    def put(self, work: Callable[[], object], most: int = MOST_WAITING) -> bool:
+        """Queue this work, or return False if `most` pieces are queued. Does not wait.
+
+        Work is done in order.
+        """
+        is_queued = self._work.qsize() < most
+        if is_queued:
             self._work.put(work)
         if self._begun.acquire(blocking=False):
             try:
@@ -43,6 +47,7 @@ class AsideThread:
                 self._begun.release()
                 if not isinstance(failure, (RuntimeError, MemoryError)):
                     raise
+        return is_queued
 
     def flush(self, seconds: float) -> bool:
         """Wait up to `seconds` s until all queued work is done; return True if it is done."""

@@ -27,7 +27,7 @@ from multidrop.cli.fleet import (
 )
 from multidrop.cli.support.arguments import add_json_argument, duration
 from multidrop.cli.support.files import require_extra
-from multidrop.cli.support.log_thread import LogThread, add_log_argument, logging_to_stderr
+from multidrop.cli.support.log_thread import add_log_argument, logging_to_stderr
 from multidrop.cli.support.output import print_json, print_text
 from multidrop.cli.support.signals import cancel_at_end_signals, on_end_signals, run_loop
 from multidrop.cli.support.values import counted
@@ -71,11 +71,11 @@ def _add_serve(parser: argparse.ArgumentParser) -> None:
 
 def _run_serve(arguments: argparse.Namespace) -> int:
     require_fleet()
-    with logging_to_stderr(arguments.log, GATEWAY_LEVELS) as log:
-        return run_loop(_serve(arguments, log))
+    with logging_to_stderr(arguments.log, GATEWAY_LEVELS):
+        return run_loop(_serve(arguments))
 
 
-async def _serve(arguments: argparse.Namespace, log: LogThread) -> int:
+async def _serve(arguments: argparse.Namespace) -> int:
     from importlib.metadata import version
 
     from multidrop.fleet.gateway import FleetGateway
@@ -89,7 +89,6 @@ async def _serve(arguments: argparse.Namespace, log: LogThread) -> int:
     options = nats_options(arguments, urls)
     gateway = FleetGateway(name, urls, folder, options=options, spool_bytes=parse_size(arguments.keep))
     on_end_signals(gateway.end)
-    supervisor().watch("log", log.is_alive)
     async with AsyncExitStack() as stack:
         if listener:
             release = version("multidrop")

@@ -6,18 +6,17 @@ import argparse
 import json
 import logging
 import os
-import queue
 import sys
-import threading
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
+from contextlib import AbstractContextManager, suppress
 from datetime import UTC, datetime
+from functools import partial
 from typing import TextIO
 
 from multidrop.cli.support.output import logging_by
 from multidrop.printable import masked, printable
+from multidrop.transport.aside_log import MOST_WAITING, AsideThread
 
-MOST_WAITING = 10_000  # limit of the lines in the queue
 ENDING_S = 1.0  # how long `close` waits until the last lines are written, in s
 
 
@@ -33,41 +32,27 @@ class LogThread(logging.Handler):
             # terminal.
             own = os.dup(stream.fileno())
             self._file = os.fdopen(own, "w", 1, encoding=stream.encoding, errors="backslashreplace")
-        self._waiting: queue.Queue[str | None] = queue.Queue(MOST_WAITING)
+        self._thread = AsideThread("multidrop log")
         self._lost = 0
-        self._thread = threading.Thread(target=self._write, name="multidrop log", daemon=True)
-        self._thread.start()
-
-    def is_alive(self) -> bool:
-        return self._thread.is_alive()
 
     def emit(self, record: logging.LogRecord) -> None:
         """Queue a record without waiting; count it as lost if the queue is full."""
-        try:
-            self._waiting.put_nowait(self.format(record))
-        except queue.Full:
+        if not self._thread.put(partial(self._write, self.format(record)), MOST_WAITING):
             self._lost += 1
 
     def close(self) -> None:
-        """Stop the thread; wait up to ENDING_S for the last lines."""
-        with suppress(queue.Full):
-            self._waiting.put_nowait(None)
-        if self._thread.ident is not None:  # Ctrl-C may come before the thread's start
-            self._thread.join(ENDING_S)
+        """Wait up to ENDING_S for the last lines."""
+        if self._file is not self._stream:
+            self._thread.put(self._file.close)
+        self._thread.flush(ENDING_S)
         super().close()
 
-    def _write(self) -> None:
-        while (line := self._waiting.get()) is not None:
-            if self._lost:
-                lost, self._lost = self._lost, 0
-                text = f"{lost} later lines of the log are lost: its reader was too slow"
-                self._put(
-                    self.format(logging.LogRecord("multidrop", logging.WARNING, "", 0, text, None, None))
-                )
-            self._put(line)
-        if self._file is not self._stream:
-            with suppress(OSError):
-                self._file.close()
+    def _write(self, line: str) -> None:
+        if self._lost:
+            lost, self._lost = self._lost, 0
+            text = f"{lost} later lines of the log are lost: its reader was too slow"
+            self._put(self.format(logging.LogRecord("multidrop", logging.WARNING, "", 0, text, None, None)))
+        self._put(line)
 
     def _put(self, line: str) -> None:
         with suppress(OSError, ValueError):  # the disk is full, or the reader is gone
@@ -107,12 +92,9 @@ def _time(record: logging.LogRecord) -> str:
 FORMATTERS = {"text": TextFormatter, "json": JsonFormatter}
 
 
-@contextmanager
-def logging_to_stderr(form: str, levels: Mapping[str, int]) -> Iterator[LogThread]:
+def logging_to_stderr(form: str, levels: Mapping[str, int]) -> AbstractContextManager[None]:
     """While the context lasts, write these loggers' messages to stderr, from the given levels up."""
-    log = LogThread(sys.stderr, FORMATTERS[form]())
-    with logging_by(log, levels):
-        yield log
+    return logging_by(LogThread(sys.stderr, FORMATTERS[form]()), levels)
 
 
 def add_log_argument(parser: argparse.ArgumentParser) -> None:
