@@ -330,6 +330,8 @@ class Bus:
         no stop. Calls that move a motor, made before or during this call, raise CancelledByStop. If this call
         is interrupted, each drive whose motor is not seen to stand still gets one more stop.
         """
+        # the loop of `_BoundStop.__call__`; in a shared function, Ctrl-C between its return and this call's
+        # next instruction would lose the stops
         run: StopRun | None = None
         tried = 0
         while True:
