@@ -8,7 +8,6 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -118,27 +117,16 @@ _DECIMAL = re.compile(r"-?[0-9]{1,19}")
 _ANY_BASE = re.compile(r"0[xX][0-9a-fA-F]{1,8}|0|[1-9][0-9]{0,5}")
 
 
-class Treatment(Enum):
-    """What an importer does with a key of the source's schema."""
-
-    IMPORTED = "the importer reads it"
-    IRRELEVANT = "it changes no value"
-    GAP = "it may change the value: a gap is marked"
-
-
-KeyTable = Mapping[str, Treatment]
+# for each key of the source's schema: True if it may change a register's value, but is not imported
+KeyTable = Mapping[str, bool]
 
 
 def key_table(*, imported: str = "", irrelevant: str = "", gap: str = "") -> KeyTable:
-    """Return the treatment of each key.
+    """Return the table of these keys, which are separated by spaces.
 
-    Each argument has the keys with one treatment, separated by spaces.
+    An `irrelevant` key changes no value. For a `gap`, the family file has a comment.
     """
-    return {
-        **dict.fromkeys(imported.split(), Treatment.IMPORTED),
-        **dict.fromkeys(irrelevant.split(), Treatment.IRRELEVANT),
-        **dict.fromkeys(gap.split(), Treatment.GAP),
-    }
+    return {**dict.fromkeys(f"{imported} {irrelevant}".split(), False), **dict.fromkeys(gap.split(), True)}
 
 
 def unimported_keys(entry: Mapping[Any, Any], table: KeyTable) -> list[str]:
@@ -146,9 +134,9 @@ def unimported_keys(entry: Mapping[Any, Any], table: KeyTable) -> list[str]:
 
     Keys that the table lacks are included. Keys with empty or false values are ignored.
     """
-    known = {Treatment.GAP: "{} was not carried over", None: "{} is not known here, and was not carried over"}
+    sentences = {True: "{} was not carried over", None: "{} is not known here, and was not carried over"}
     found = ((str(key)[:40], table.get(key)) for key, value in entry.items() if not is_empty(value))
-    return [known[treatment].format(key) for key, treatment in found if treatment in known]
+    return [sentences[is_gap].format(key) for key, is_gap in found if is_gap in sentences]
 
 
 def is_empty(value: Any) -> bool:

@@ -17,7 +17,6 @@ from multidrop.importers.device import (
     ImportedDevice,
     ImportedRegister,
     LineSettings,
-    Treatment,
     key_table,
     network_settings,
     serial_settings,
@@ -55,7 +54,7 @@ _SHOWN = (
     "read_period_ms read_rate_limit_ms poll_interval mode precision unit ui_options original_name"
 )
 CHANNEL_KEYS = {
-    PART: Treatment.GAP,
+    PART: True,
     **key_table(
         imported=f"{_ENTRY} error_value unsupported_value string_data_size readonly enum enum_titles "
         "consists_of device_type oneOf shift stride",
