@@ -145,7 +145,7 @@ def _device(
     most = template.get("max_read_registers")
     device.together = most if isinstance(most, int) and 1 <= most <= MOST_READ else 0
     shift, stride = whole(template, "shift", 0), whole(template, "stride", 0)
-    _Walk(device, template, "modbus-io" in protocol).add(template, (), shift, stride, 0)
+    _Walk(device, template, "modbus-io" in protocol).add(template, (), shift, stride)
     device.lose_keys("the device", template, DEVICE_KEYS)
     return device
 
@@ -174,18 +174,16 @@ class _Walk:
             self._subdevices[kind] = each["device"]
             self._unused.add(kind)
 
-    def add(
-        self, template: Mapping[str, Any], outer: tuple[str, ...], shift: int, stride: int, depth: int
-    ) -> None:
+    def add(self, template: Mapping[str, Any], outer: tuple[str, ...], shift: int, stride: int) -> None:
         """Add entries of a template; `outer` names the channels that contain them, the outermost first."""
         for key in ("channels", "parameters"):
             for name, entry in _flat(_listed(template.get(key))):
                 with self._device.entry(" ".join((*outer, name))):
-                    self._entry((*outer, name), entry, shift, stride, depth)
+                    self._entry((*outer, name), entry, shift, stride)
         if template.get("setup"):
             reason = "writes at every start are never sent, for they wear the EEPROM"
             self._device.lose("setup", reason, is_entry=False)
-        for kind in sorted(self._unused) if depth == 0 else ():
+        for kind in () if outer else sorted(self._unused):
             self._device.lose(f"subdevice {kind}", "no channel uses it, so its address is not known")
 
     def _titles(self, path: tuple[str, ...], entry: Mapping[str, Any]) -> dict[str, str]:
@@ -197,9 +195,7 @@ class _Walk:
                 found[language] = " ".join([*(words.get(one, one) for one in outer), own])[:LONGEST_TITLE]
         return found
 
-    def _entry(
-        self, path: tuple[str, ...], entry: Mapping[str, Any], shift: int, stride: int, depth: int
-    ) -> None:
+    def _entry(self, path: tuple[str, ...], entry: Mapping[str, Any], shift: int, stride: int) -> None:
         name = " ".join(path)
         if "device_type" not in entry and "oneOf" not in entry:
             if {"address", "write_address"} & entry.keys():
@@ -215,14 +211,14 @@ class _Walk:
             self._device.lose(name, f"the configuration chooses which subdevice it is: {choices}")
         elif kind not in self._subdevices:
             self._device.lose(name, f"its subdevice {kind[:40]} is not in this file")
-        elif depth >= _DEEPEST:
+        elif len(path) > _DEEPEST:
             self._device.lose(name, f"more than {_DEEPEST} subdevices in each other")
         else:
             inner = self._subdevices[kind]
             self._declare(inner)
             self._unused.discard(kind)
             further = shift + whole(entry, "shift", 0)
-            self.add(inner, path, further, whole(entry, "stride", 0), depth + 1)
+            self.add(inner, path, further, whole(entry, "stride", 0))
 
 
 def _listed(found: Any) -> list[tuple[str, Any]]:
