@@ -187,7 +187,7 @@ class Capture:
         self._is_ours = False
         self._file = self.path.open("rb", buffering=0)
         self._order = "<"
-        self._unpacker: Unpacker | None = None
+        self._unpacker: Unpacker  # set by `_begin`, which raises otherwise
         try:
             self._begin()
         except BaseException:
@@ -196,7 +196,7 @@ class Capture:
 
     @property
     def streams(self) -> list[Stream]:
-        return self._unpacker.streams if self._unpacker else []
+        return self._unpacker.streams
 
     def close(self) -> None:
         self._file.close()
@@ -234,14 +234,13 @@ class Capture:
     def __iter__(self) -> Iterator[None]:
         """Fill `streams` from the file. At each yield the caller must empty them."""
         unpacker = self._unpacker
-        assert unpacker is not None
         seen = unpacker.at  # position in the file after the last byte read so far
         while True:
             state = unpacker.unpack()
             if state is Unpacked.NONSENSE:
                 raise self._damaged(unpacker.at)
             if state is Unpacked.OTHER_BLOCK:
-                if not self._read_block(unpacker):
+                if not self._read_block():
                     break
             elif state is Unpacked.FULL:
                 yield
@@ -267,9 +266,9 @@ class Capture:
             )
         return piece
 
-    def _read_block(self, unpacker: Unpacker) -> bool:
+    def _read_block(self) -> bool:
         """Read a block other than an enhanced packet; return False if the file ends within it."""
-        at = unpacker.at
+        at = self._unpacker.at
         kind = self._read("I", at)
         if kind == SECTION and self._size - at >= _PCAPNG_HEADER and self._order_at(at) != self._order:
             raise CaptureError(
@@ -296,7 +295,7 @@ class Capture:
                 f"{self.path}: byte {at}: simple and obsolete packet blocks cannot be read; `editcap` "
                 f"converts them to enhanced packet blocks"
             )
-        unpacker.at = at + size
+        self._unpacker.at = at + size
         return True
 
     def _read_interface(self, body: bytes, at: int) -> None:
@@ -317,7 +316,6 @@ class Capture:
         self._add(link, name or f"{self.path.stem}-{len(self.lines)}", ticks_per_s, seconds * 10**9)
 
     def _add(self, link: int, name: str, ticks_per_s: int, offset_ns: int) -> None:
-        assert self._unpacker is not None
         if link in _NO_SERIAL_LINE:
             raise CaptureError(
                 f"{self.path}: {name} is {_NO_SERIAL_LINE[link]} (link type {link}), not a serial line"
