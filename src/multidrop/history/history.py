@@ -118,7 +118,8 @@ class History:
 
         def gathered(found: Listing) -> dict[str, Buckets]:
             into = {name: UnitBuckets(grid) for name in names}
-            units = UnitHistory(self._sources.known(found, grid.begin, grid.end), names)
+            units = UnitHistory(names)
+            units.learn(self._sources.known(found, grid.begin, grid.end))
             self._gather(found, into, grid, units)
             return {
                 ".".join(name): made.buckets(units.unit_of(name), units.left_out.get(name, ()))
@@ -201,7 +202,7 @@ class HistoryRows(RecordingReader):
     def __init__(self, sources: Sources, query: Query) -> None:
         super().__init__(sources.folder)
         self._sources, self._query = sources, query
-        self._units = UnitHistory({}, query.series)
+        self._units = UnitHistory(query.series)
         sources.again(self._learnt)
         self.metadata = self._units.described(sources.metadata())
 

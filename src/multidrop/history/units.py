@@ -95,13 +95,12 @@ class UnitHistory:
     another register name, such as "load [A]". `series` None means all series that the segments describe.
     """
 
-    def __init__(self, known: Mapping[int, FileUnits], series: Iterable[Series] | None = None) -> None:
+    def __init__(self, series: Iterable[Series] | None) -> None:
         self._known: dict[int, FileUnits] = {}
         self._series = None if series is None else list(series)
         self.newest: dict[Series, SeriesUnit] = {}
         self.left_out: dict[Series, list[str]] = {}
         self._columns: dict[tuple[Series, SeriesUnit], str] = {}
-        self.learn(known)
 
     def learn(self, known: Mapping[int, FileUnits]) -> None:
         """Add the units of new segments. Columns that were already assigned to a unit stay the same."""

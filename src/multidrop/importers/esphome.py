@@ -33,8 +33,7 @@ _ITEM = "platform modbus_controller_id id name address register_type offset byte
 _SHOWN = (
     "internal disabled_by_default icon entity_category device_class web_server web_server_id "
     "web_server_sorting_weight mqtt_id setup_priority update_interval device_id force_new_range "
-    "response_size "
-    "on_value on_state qos retain discovery availability state_topic command_topic"
+    "response_size on_value on_state qos retain discovery availability state_topic command_topic"
 )
 _TIMES = "skip_updates custom_command"  # entries with custom_command, which sends raw bytes, are not imported
 _WRITES = "write_lambda"

@@ -332,8 +332,7 @@ def _more(entry: Mapping[str, Any]) -> int:
 
 def _repeat(device: ImportedDevice, register: ImportedRegister, entry: Mapping[str, Any], words: int) -> None:
     """Add the register, and `slave_count` or `virtual_count` further registers after it."""
-    first = replace(register, details=dict(register.details), gaps=list(register.gaps))
     for at in range(_more(entry) + 1):
-        name = f"{first.name}_{at}" if at else first.name
-        details, gaps = dict(first.details), list(first.gaps)
-        device.add(replace(first, name=name, address=first.address + at * words, details=details, gaps=gaps))
+        name, address = f"{register.name}_{at}" if at else register.name, register.address + at * words
+        details, gaps = dict(register.details), list(register.gaps)
+        device.add(replace(register, name=name, address=address, details=details, gaps=gaps))
