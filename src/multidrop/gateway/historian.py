@@ -161,8 +161,6 @@ class Historian:
         only this call raises ValueError.
         """
         series, begin_ns, end_ns = names or None, begin * MS_NS, end * MS_NS
-        if kind not in ("csv", "parquet"):
-            raise ValueError(f"format = {kind!r} is neither csv nor parquet")
         if kind == "csv":
             return self.history.csv(series, begin_ns, end_ns)
         self.history.read(series, begin_ns, end_ns)  # raises ValueError here, before the first piece is sent

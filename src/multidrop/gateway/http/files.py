@@ -9,7 +9,6 @@ import tomllib
 import zlib
 from collections import defaultdict
 from collections.abc import AsyncIterator, Callable, Generator, Iterator, Mapping, Sequence
-from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -22,6 +21,7 @@ from starlette.types import Receive, Scope, Send
 from multidrop import params
 from multidrop.gateway.http.messages import Denied
 from multidrop.gateway.live.drive_reads import ParameterRead
+from multidrop.printable import iso_time
 from multidrop.supervisor import supervisor
 
 PAGE = Path(__file__).parents[1] / "page"
@@ -230,7 +230,4 @@ def _what(names: Sequence[str]) -> str:
 
 def _moment(ms: int) -> str:
     """Return a UTC time for a file name, without colons, which some systems forbid."""
-    try:
-        return datetime.fromtimestamp(ms / 1000, UTC).strftime("%Y-%m-%dT%H-%M-%SZ")
-    except (ValueError, OverflowError, OSError):
-        return "a time"
+    return f"{iso_time(ms)[:19].replace(':', '-')}Z"

@@ -89,9 +89,6 @@ class Guard:
         self._clock = clock
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http":
-            return  # not an HTTP request: uvicorn refuses the connection
-
         is_page = scope["path"] == "/" or scope["path"].startswith("/page/")
         added = _RAW_PAGE_HEADERS if is_page else _RAW_HEADERS
 
@@ -141,10 +138,7 @@ class Guard:
     def _find(self, path: str) -> RouteAccess:
         """Return the method and the right that a path needs: the entry of its longest prefix in `needed`."""
         while path not in self._needed:
-            head, slash, _ = path.rstrip("/").rpartition("/")
-            if not slash:
-                return self._needed["/"]
-            path = f"{head}/"
+            path = f"{path.rstrip('/').rpartition('/')[0]}/"
         return self._needed[path]
 
     def _check_site(self, headers: Headers, host: str, needed: RouteAccess, schemes: Sequence[str]) -> None:

@@ -107,10 +107,6 @@ class ModbusServer:
     def address_map(self) -> list[AddressRow]:
         return address_map(self._units, self.settings, self.ports, self._commands.may)
 
-    @property
-    def clients(self) -> int:
-        return sum(len(port.clients) for port in self._listening)
-
     # ---- requests ----
 
     def serve(self, port: str, request: MbapRequest, client: ModbusClient) -> Answer:
