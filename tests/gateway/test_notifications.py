@@ -19,14 +19,17 @@ from gateways import served
 from lines import PATIENCE, until
 from tables import table
 
+from multidrop import Plant
 from multidrop.gateway import sending
 from multidrop.gateway.live.alarms import FAULT, PORT, Alarm, AlarmChange, Alarms
 from multidrop.gateway.live.hub import RUNS, Shown
 from multidrop.gateway.notifications import (
+    MOST_TARGETS,
     MOST_WAITING,
     AlarmQueue,
     AlarmTarget,
     Notifications,
+    NotifySettings,
     Sender,
     message_of,
     read_targets,
@@ -283,6 +286,18 @@ def test_the_error_about_an_invalid_notification_target_shows_no_secret(
     assert (found, sentence in mistake, "T0K3N" in mistake) == ([], True, False)
 
 
+def test_mistakes_in_the_settings_for_notifications_are_reported(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="most = 0 is not 1 to") as wrong:
+        NotifySettings(on=("fire",), most=0)
+    assert "on: 'fire' is not a kind of alarm" in str(wrong.value)
+    plant = Plant((), tmp_path / "plant.toml")
+    [mistake] = NotifySettings().check(plant)
+    assert mistake.endswith("targets cannot be read: No such file or directory")
+    (tmp_path / "targets").write_text("https://hooks.example/\n" * (MOST_TARGETS + 1))
+    [mistake] = NotifySettings().check(plant)
+    assert f"has {MOST_TARGETS + 1} targets, but {MOST_TARGETS} at most are allowed" in mistake
+
+
 def test_the_shown_name_of_a_notification_target_contains_no_secret(tmp_path: Path) -> None:
     (tmp_path / "targets").write_text("https://hooks.example/T0K3N?key=T0K3N\ntgram://T0K3N/1\n")
     found, _ = read_targets(tmp_path / "targets")
@@ -305,6 +320,8 @@ def test_a_missing_apprise_library_is_reported(tmp_path: Path, monkeypatch: pyte
 @pytest.mark.filterwarnings("ignore:.*imghdr:DeprecationWarning")  # Apprise imports the deprecated imghdr
 def test_apprise_sends_the_title_and_the_text(webhook: Posted) -> None:
     pytest.importorskip("apprise")
+    with pytest.raises(ValueError, match="target is not an address that Apprise knows"):
+        sender_to(AlarmTarget("target", "nosuch://x"))
     send = sender_to(AlarmTarget("target", webhook.url.replace("http://", "json://")))
     send(described(BEGUN, 0))
     [posted] = webhook.batches
@@ -323,6 +340,7 @@ def test_faults_and_exceeded_limits_are_sent_as_messages(tmp_path: Path, webhook
         gateway.await_state("pump-1", "stands")
         gateway.sims["pump-1"].trip(4)  # type: ignore[attr-defined]
         until(lambda: len(webhook.batches) == 2)
+        until(lambda: "\nmultidrop_notifications_sent_total 2.0\n" in gateway.get("/metrics").body.decode())
         webhook.status = 500
         gateway.sims["pump-1"].motor.reset()  # type: ignore[attr-defined]
         until(lambda: "500" in gateway.get("/health").json["parts"].get("notify", ""))

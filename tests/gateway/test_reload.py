@@ -30,6 +30,7 @@ from lines import HOST_LATE, PATIENCE, until
 import multidrop
 from multidrop import Batch, Bus, InvtCHE, LineError, Plant
 from multidrop.core import Names, boottime_ns, now_ns
+from multidrop.gateway import reload
 from multidrop.gateway.http.rights import Right, new_token
 from multidrop.gateway.live import drive_reads
 from multidrop.polling.added_rows import AddedRow, JoinedColumns
@@ -173,7 +174,9 @@ def test_a_reload_adds_and_removes_drives_and_keeps_unchanged_lines(tmp_path: Pa
         assert gateway.gateway.failures == {}
 
 
-def test_late_rows_of_a_changed_drive_are_dropped_after_a_reload(tmp_path: Path) -> None:
+def test_late_rows_of_a_changed_drive_are_dropped_after_a_reload(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A late row was requested before the reload, so the measuring unit of its value is unknown."""
     with two_lines(tmp_path) as (gateway, rows):
         edit(gateway, 'name = "fan-1"', 'name = "fan-2"')
@@ -187,6 +190,9 @@ def test_late_rows_of_a_changed_drive_are_dropped_after_a_reload(tmp_path: Path)
         until(lambda: ("fan-2", "ok", later_ns) in rows.found)
         assert ("pump-1", "ok", asked_ns) in rows.found
         assert ("fan-2", "ok", asked_ns) not in rows.found
+        assert gateway.gateway.reload._changed == {"fan-1", "fan-2"}
+        monkeypatch.setattr(reload, "SETTLED_NS", 0)
+        until(lambda: not gateway.gateway.reload._changed)  # by the next polled rows of fan-2
 
 
 @pytest.mark.slow

@@ -208,6 +208,16 @@ def test_a_refused_message_is_skipped_if_the_next_one_is_accepted(clocked: Clock
     assert (clocked.receiver.sequences, clocked.forwarder.refused) == ([2], 50)
 
 
+def test_a_message_damaged_on_the_disk_is_skipped_and_counted(clocked: Clocked) -> None:
+    for number in range(3):
+        store(clocked.spool, number * 5, 5)
+    damaged = clocked.spool.following(1)
+    assert damaged is not None
+    damaged.path.write_bytes(b"no rows")
+    assert clocked.send_all() == inf
+    assert (clocked.receiver.sequences, clocked.forwarder.refused) == ([3, 1], 50)
+
+
 def test_no_message_is_lost_while_the_receiver_refuses_all_messages(clocked: Clocked) -> None:
     clocked.receiver.failure = Refused("HTTP Error 400: database is required")
     for number in range(5):

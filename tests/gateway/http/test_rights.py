@@ -20,6 +20,7 @@ from multidrop import Drive, InvtCHE, Plant, WriteForbidden
 from multidrop.control import CommandOutcome, CommandResult
 from multidrop.gateway import commands
 from multidrop.gateway.commands import BUSY, STOPPING, VERBS, Commands
+from multidrop.gateway.http import rights
 from multidrop.gateway.http.rights import (
     MOST_WRONG,
     NEVER_THIS_WAY,
@@ -30,6 +31,7 @@ from multidrop.gateway.http.rights import (
     May,
     OwnNames,
     Right,
+    Tokens,
 )
 
 MAY = '[serve.may]\nwrite = ["pump-1.setpoint"]\nverbs = ["pump-1.start", "pump-1.reset_fault"]\n'
@@ -166,6 +168,7 @@ FOREIGN = {
     "another name with our port": ({"host": "evil.test:8750"}, 421),
     "no host name": ({"host": "plant.example/x"}, 421),
     "an empty name": ({"host": ""}, 421),
+    "a port that cannot exist": ({"host": "localhost:65536"}, 421),
     "a page of another site": ({"origin": "http://evil.test"}, 403),
     "the same port with TLS, which we have not": ({"host": "localhost", "origin": "https://localhost"}, 403),
     "another port of this machine": ({"origin": "http://localhost:1"}, 403),
@@ -256,6 +259,8 @@ def test_wrong_http_methods_and_invalid_bodies_are_refused(open_gateway: Served)
     assert post("/api/plant").status == 405
     assert open_gateway.request("PUT", "/api/stop").status == 405
     assert open_gateway.request("OPTIONS", "/api/stop").status == 405
+    assert open_gateway.request("OPTIONS", "*").status == 405
+    assert get("/api/plant", cookie="a/b=c").status == 200  # an invalid cookie counts as none
     assert post("/api/act", b"no json").json == {"error": "the body is not JSON"}
     assert post("/api/act", b"[" * 50_000).status == 400
     assert post("/api/act", b"[]").json == {"error": "the body is not a JSON object"}
@@ -332,6 +337,15 @@ def test_callers_behind_a_proxy_do_not_count_as_local(tmp_path: Path) -> None:
             assert gateway.post(*STOP, **told).status == 401, told
             assert gateway.get("/api/plant", **told).json["may"]["role"] == "look", told
         assert gateway.gateway.commands.called == 0
+
+
+def test_wrong_tokens_of_only_the_newest_addresses_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rights, "MOST_ADDRESSES", 2)
+    tokens = Tokens()
+    for address in ("10.0.0.1", "10.0.0.2", "10.0.0.3"):
+        for at in range(MOST_WRONG):
+            tokens.note_wrong(address, f"wrong-{at}", 0.0)
+    assert [tokens.is_shut(f"10.0.0.{at}", 0.0) for at in (1, 2, 3)] == [False, True, True]
 
 
 def test_only_the_sender_of_wrong_tokens_is_blocked_behind_a_proxy(tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from multidrop.control.eeprom_ledger import LedgerCell
 from multidrop.core import Counters, Status
 from multidrop.drive import parameters
 from multidrop.drive.parameters import ParameterGroup, ParameterSpace
+from multidrop.drive.register import Register
 from multidrop.families import ErmanERG220, InvtCHE
 from multidrop.gateway.live import drive_reads
 from multidrop.gateway.live.drive_reads import Identities
@@ -189,6 +190,25 @@ def test_unpolled_registers_are_not_read_from_a_silent_drive(gateway: Served) ->
         for _ in range(20):
             assert gateway.get("/api/drive/pump-2").json["values"] == {}
     assert asked == []
+
+
+def test_an_unpolled_register_without_a_reply_is_read_once(
+    gateway: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each attempt costs a timeout."""
+    asked: list[str] = []
+
+    def read(register: Register[Any]) -> None:
+        asked.append(register.name)
+        raise NoReply("pump-1")
+
+    pump = next(each for each in gateway.gateway.bus("hall").drives if each.name == "pump-1")
+    monkeypatch.setattr(drive_reads, "PAUSE_S", 0.0)
+    monkeypatch.setattr(drive_reads, "SHARE", 0)
+    monkeypatch.setattr(pump, "read", read)
+    gateway.get("/api/drive/pump-1")
+    until(lambda: asked and not gateway.gateway.side_reads.under_way)
+    assert len(asked) == len(set(asked))
 
 
 @pytest.mark.long

@@ -125,6 +125,13 @@ def test_a_read_by_each_modbus_function_gets_the_drives_reply(rig: Rig, tool: in
     assert rig.line.asked == [("mill", 3, 16, 2), ("mill", 4, 0x7000, 1), ("mill", 1, 1, 10)]
 
 
+def test_a_tool_can_read_the_status_and_the_identification_of_a_drive(rig: Rig, tool: int) -> None:
+    assert ask(tool, "01 07") == bytes.fromhex("01 07 2A")
+    assert ask(tool, "01 11") == bytes.fromhex("01 11 01 2A")  # this reply states its length
+    assert ask(tool, "01 2B 0E 01 00") == bytes.fromhex("01 2B 2A")
+    assert rig.line.asked == [("mill", 0x07, 0, 0), ("mill", 0x11, 0, 0), ("mill", 0x2B, 0x0100, 0)]
+
+
 def test_a_failed_read_of_a_modbus_tool_gets_no_reply_or_an_exception(rig: Rig) -> None:
     with opened(str(rig.link)) as tool:
         for failure, answer in (
@@ -356,6 +363,25 @@ def test_a_ninth_modbus_tool_on_one_tcp_port_is_refused(rig: Rig) -> None:
     finally:
         for tool in tools:
             tool.close()
+
+
+def test_an_idle_modbus_tool_is_disconnected_when_another_one_connects(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    where = ("127.0.0.1", rig.ports.ports["hall"])
+    with socket.create_connection(where, PATIENCE) as idle:
+        assert ask(idle.fileno(), "01 03 00 10 00 01") == bytes.fromhex("01 03 02 0010")
+        monkeypatch.setattr(tool_ports, "IDLE_S", 0.0)
+        with socket.create_connection(where, PATIENCE):
+            assert idle.recv(1) == b""
+
+
+def test_a_modbus_tool_at_another_address_than_those_of_the_settings_is_refused(tmp_path: Path) -> None:
+    with (
+        serving(tmp_path, clients=["10.0.0.7"]) as rig,
+        socket.create_connection(("127.0.0.1", rig.ports.ports["hall"]), PATIENCE) as tool,
+    ):
+        assert tool.recv(1) == b""
 
 
 def test_a_modbus_tool_can_connect_after_a_failed_accept(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -392,14 +392,16 @@ def test_a_command_sent_before_a_stop_is_refused(
     assert len(commanded.commands.noted) == (3 if is_taken else 1)
 
 
-def test_a_command_is_refused_if_its_payload_names_another_drive(
+def test_a_command_is_refused_if_it_names_another_drive_or_its_options_are_a_list(
     broker: Broker, listener: Listener, commanded: Any
 ) -> None:
     act = {"verb": "start", "drive": "pump-1", "options": {"direction": "forward"}, "time": now_ms()}
     publish(broker, f"multidrop/{FAN.name}/act", json.dumps(act).encode())
     assert "the message names drive 'pump-1'" in told(listener, FAN.name)["text"]
+    publish(broker, "multidrop/pump-1/act", json.dumps({**act, "options": ["forward"]}).encode())
+    assert "key 'options' is not a JSON object" in told(listener)["text"]
     publish(broker, "multidrop/pump-1/act", json.dumps(act).encode())
-    assert told(listener)["done"]
+    listener.wait_for(lambda one: one.topic == "multidrop/pump-1/told" and one.json["done"])
     assert commanded.commands.noted == [("act", "pump-1", "start", {"direction": "forward"})]
 
 

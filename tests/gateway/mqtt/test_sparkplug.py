@@ -353,6 +353,19 @@ def test_a_command_of_a_sparkplug_host_is_decoded(field: str, value: object) -> 
     assert read_command(sent.SerializeToString()) == (1234, [setpoint, ReceivedMetric("nothing", None, None)])
 
 
+@table(
+    ("data", "sentence"),
+    [
+        (bytes(65_537), "the payload has 65537 bytes; the limit is 65536"),
+        (b"\x12\x05\x62\x03abc", "a float has 3 bytes; it must have 4 or 8"),
+        (b"\x08" + b"\xff" * 10, "a varint has no last byte"),
+    ],
+)
+def test_an_invalid_payload_of_a_sparkplug_host_is_refused(data: bytes, sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        read_command(data)
+
+
 @given(st.binary(max_size=300))
 def test_decoding_random_bytes_raises_only_value_error(data: bytes) -> None:
     try:

@@ -222,6 +222,53 @@ def test_an_opc_ua_request_for_too_many_nodes_is_refused(gateway: Served) -> Non
             client.read_values([state] * (server.MOST_OPERATIONS + 1))
 
 
+def test_an_opc_ua_client_may_not_exceed_the_limits_of_its_subscriptions(
+    gateway: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with Client(f"opc.tcp://127.0.0.1:{port_of(gateway)}/", timeout=PATIENCE) as client:
+        state = client.get_node("ns=2;s=pump-1.State")
+        subscription = client.create_subscription(1000, SimpleNamespace())
+        handle = subscription.subscribe_data_change(state)
+        modify = subscription.aio_obj.modify_monitored_item(handle, 1000.0, 1_000_000)
+        [changed] = client.tloop.post(modify)
+        assert changed.RevisedQueueSize == server.MOST_QUEUED
+        monkeypatch.setattr(server, "MOST_ITEMS", 2)
+        with pytest.raises(ua.UaStatusCodeError, match="BadTooManyMonitoredItems"):
+            subscription.subscribe_data_change([state, state])
+
+
+def test_opc_ua_clients_cannot_register_servers(gateway: Served) -> None:
+    with (
+        Client(f"opc.tcp://127.0.0.1:{port_of(gateway)}/", timeout=PATIENCE) as client,
+        pytest.raises(ua.UaStatusCodeError, match="BadServiceUnsupported"),
+    ):
+        client.tloop.post(client.aio_obj.uaclient.register_server(ua.RegisteredServer()))
+
+
+def test_only_opc_ua_sessions_without_a_login_are_replaced_by_new_sessions(
+    gateway: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    part: Any = gateway.gateway.feeds["opcua"]
+    until(lambda: not part._opened[2]._session.iserver._external_sessions)
+    monkeypatch.setattr(server, "MOST_CLIENTS", 1)  # so at most two sessions
+    url = f"opc.tcp://127.0.0.1:{port_of(gateway)}/"
+
+    async def connect() -> None:
+        async with AsyncClient(url, timeout=PATIENCE) as first:
+            unused = AsyncClient(url, timeout=PATIENCE)
+            await unused.connect_socket()
+            await unused.send_hello()
+            await unused.open_secure_channel()
+            await unused.create_session()
+            async with AsyncClient(url, timeout=PATIENCE):
+                with pytest.raises(ua.UaStatusCodeError, match="BadTooManySessions"):
+                    await AsyncClient(url, timeout=PATIENCE).connect()
+                await first.get_node("ns=2;s=pump-1.State").read_data_value(raise_on_bad_status=False)
+            unused.disconnect_socket()
+
+    asyncio.run(connect())
+
+
 def make_certificate(folder: Path, name: str) -> None:
     subprocess.run(
         [

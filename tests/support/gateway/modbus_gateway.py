@@ -109,6 +109,8 @@ class FakeLine:
         await asyncio.sleep(self.seconds)
         if self.failure is not None:
             raise self.failure
+        if not count:
+            return [42]  # the data of a request without addresses
         return [(start + at) & (1 if function < 3 else 0xFFFF) for at in range(count)]
 
 
