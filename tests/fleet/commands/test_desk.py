@@ -313,7 +313,7 @@ async def test_copies_of_a_stop_cause_one_stop_and_cancel_waiting_commands(desk:
     ("failure", "why"),
     [
         (OSError(28, "No space left on device"), "[Errno 28] No space left on device"),
-        (SystemExit("killed"), "commands.jsonl: RuntimeError: SystemExit: killed"),  # of the log's thread
+        (SystemExit("killed"), "commands.jsonl: SystemExit: killed"),  # in the log's thread
     ],
 )
 async def test_a_failed_log_blocks_commands_but_not_stops(
@@ -587,10 +587,12 @@ async def test_command_log_keeps_records_in_order_until_closed(tmp_path: Path) -
 async def test_command_log_refuses_records_while_too_many_wait_for_the_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    disk, log = threading.Event(), CommandLog(tmp_path / "commands.jsonl")
+    begun, disk, log = threading.Event(), threading.Event(), CommandLog(tmp_path / "commands.jsonl")
     monkeypatch.setattr(log_module, "MOST_WAITING", 2)
-    with patch.object(CommandLog, "_add", lambda *record: disk.wait()):
-        waiting = [asyncio.create_task(log.note({})) for _ in range(2)]
+    with patch.object(CommandLog, "_add", lambda *record: begun.set() or disk.wait()):
+        waiting = [asyncio.create_task(log.note({}))]
+        assert await asyncio.to_thread(begun.wait, PATIENCE_S)
+        waiting += [asyncio.create_task(log.note({})) for _ in range(2)]
         await asyncio.sleep(0)
         with pytest.raises(
             OSError, match=r"commands\.jsonl: 2 records are already waiting; does the disk answer"
