@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+from collections import Counter
 from fnmatch import fnmatch
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -98,6 +99,8 @@ TIED = (  # groups of files whose annotations refer to each other
     {f"gateway/{name}.py" for name in ("gateway", "reload", "metrics", "live/views", "http/routes")},
 )
 MOST_LINES_OF_A_FILE = 600
+MOST_FILES = {"src": 300, "tests": 350}
+MOST_FILES_OF_A_FOLDER = 25
 IMPORT_OF_A_TEST = re.compile(r"\b(import|from)\b.*\btest_")
 
 
@@ -220,6 +223,15 @@ def test_no_source_file_is_longer_than_the_limit() -> None:
         for path in [*FILES, *files("csrc", suffixes=(".c", ".h"))]
     }
     assert {name for name, count in lines.items() if count > MOST_LINES_OF_A_FILE} == set()
+
+
+@table("room", MOST_FILES)
+def test_src_and_tests_have_few_files(room: str) -> None:
+    """Join two files or remove one before a new file would exceed the limit."""
+    found = files(room, suffixes=(".py", ".c", ".h"))
+    assert 100 < len(found) <= MOST_FILES[room]
+    counts = Counter(path.parent for path in found)
+    assert {str(folder) for folder, count in counts.items() if count > MOST_FILES_OF_A_FOLDER} == set()
 
 
 @pytest.mark.long
