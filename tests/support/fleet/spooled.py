@@ -16,7 +16,7 @@ from nats_clusters import Cluster
 
 from multidrop.core import Columns, Field, Names, NumberFormat, RowLayout, Status
 from multidrop.fleet.samples import samples_stream
-from multidrop.fleet.samples.samples_stream import create_stream, samples_path
+from multidrop.fleet.samples.samples_stream import create_stream, samples_path, stream_info
 from multidrop.fleet.servers.connections import ServerPath
 from multidrop.polling.batch import Batch
 from multidrop.samples.message import unpack
@@ -90,8 +90,12 @@ def exchanges_in(rows: list[tuple[Any, ...]]) -> list[int]:
 async def empty_stream(servers: Cluster) -> AsyncIterator[ServerPath]:
     """Yield an open ServerPath to the servers, on which the stream of samples is empty."""
     async with samples_path(servers.urls) as path:
-        await samples_stream._ask(path, "STREAM.DELETE.samples", {}, samples_stream.NO_STREAM)
-        await create_stream(path, replicas=1)
+        # On a busy machine, a new stream may get the messages of the stream that was just deleted.
+        is_empty = False
+        while not is_empty:
+            await samples_stream._ask(path, "STREAM.DELETE.samples", {}, samples_stream.NO_STREAM)
+            await create_stream(path, replicas=1)
+            is_empty = (await stream_info(path)).last == 0
         yield path
 
 
