@@ -42,6 +42,7 @@ class Event(NamedTuple):
 
 CLIENT = """
 import json, sys
+from patient import be_patient
 from toy import Toy
 from multidrop.bus import Bus
 from multidrop.core import Exchange, Framing, Message, Peer
@@ -49,6 +50,7 @@ from multidrop.errors import BusError
 from multidrop.sim import Simulator, Wire, simulated
 from multidrop.transport import open_port
 
+be_patient(setattr, dict.__setitem__)  # on a busy computer, replies may come late
 open_port.is_pseudo_terminal = lambda device: False  # its driver is a UART's
 said = []
 with Simulator([Wire([simulated(Toy(1))])]) as sim:
@@ -78,7 +80,8 @@ def play(driver: Path, mode: str, reads: int, **variables: object) -> tuple[list
     log.unlink(missing_ok=True)
     log.touch()
     settings = {"LD_PRELOAD": driver, "RS485_LOG": log, "RS485_CHARACTER_NS": CHARACTER_NS} | variables
-    paths = os.pathsep.join(map(str, [ROOT / "tests/support/drives", os.environ.get("PYTHONPATH", "")]))
+    folders = [ROOT / "tests/support" / name for name in ("drives", "simulated")]
+    paths = os.pathsep.join(map(str, [*folders, os.environ.get("PYTHONPATH", "")]))
     ran = subprocess.run(
         [sys.executable, "-c", CLIENT, mode, str(reads)],
         env=os.environ | {name: str(value) for name, value in settings.items()} | {"PYTHONPATH": paths},

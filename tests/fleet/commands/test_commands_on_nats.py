@@ -121,6 +121,7 @@ def tell(fleet: Cluster, tmp_path: Path, gateways: list[OnNats]) -> Callable[[St
     return lambda story: asyncio.run(main(story))
 
 
+@pytest.mark.usefixtures("_patient")  # a stop whose reply is late is repeated
 def test_a_command_received_over_three_servers_is_sent_once(tell: Callable[[Story], None]) -> None:
     async def story(fleet: Fleet) -> None:
         await fleet.one.open()
@@ -350,6 +351,7 @@ async def commanded(servers: SecuredCluster, made: Desks) -> AsyncIterator[Comma
         yield subjects
 
 
+@pytest.mark.usefixtures("_patient")  # a stop whose reply is late is repeated
 async def test_a_commander_may_command_and_a_viewer_may_not(servers: SecuredCluster, tmp_path: Path) -> None:
     with desks(tmp_path) as made:
         async with commanded(servers, made):
