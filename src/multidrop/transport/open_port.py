@@ -381,8 +381,8 @@ class OpenPort:
             self.bridge.forget()
             self.bridge = None
         # For a network port, close only the socket: pyserial would end the connection, which the parent still
-        # uses. Never close loop://, which has no descriptor: pyserial would wait for a lock of its queue, which
-        # a thread of the parent may hold.
+        # uses. Never close loop://, which has no descriptor: pyserial would wait for a lock of its queue, and
+        # a thread of the parent may hold this lock.
         port = connection_of(self._serial) or self._serial
         self._serial = None
         if isinstance(port, (socket.socket, serial.Serial)):
