@@ -155,6 +155,7 @@ struct md_turn {
     uint32_t room;         /* number of slots, a power of two */
     uint32_t is_idle;      /* 1: the thread may sleep, so md_port_submit() must wake it */
     int64_t owed_ns;       /* line time that polling must still get, because urgent requests took it */
+    int64_t stopping_ns;   /* until then, polling gets only its share, because another stop may follow */
     int64_t answering_ns;  /* until then, stops of drives that answer precede stops of silent drives */
     struct md_before before;
     struct md_row_queue *row_queue;
