@@ -137,6 +137,14 @@ def test_reset_fault_sends_no_write_without_a_fault(line: Line) -> None:
     assert line.writes == []
 
 
+def test_reset_fault_of_a_running_motor_is_refused(line: Line) -> None:
+    line.runs()
+    sent = len(line.writes)
+    with pytest.raises(WriteForbidden, match="it has no fault to reset"):
+        line.drive.reset_fault()
+    assert len(line.writes) == sent
+
+
 def test_a_fault_reset_raises_if_the_fault_remains(line: Line, monkeypatch: pytest.MonkeyPatch) -> None:
     line.sim.trip(FAULT)
     monkeypatch.setattr(line.sim.motor, "reset", lambda: None)
