@@ -240,13 +240,17 @@ class Schedule(Generic[J]):
         self._held = [held for held in self._held if held is not job]
         if job.interval_ns and all(other.drive != job.drive for other in self.jobs):
             self._ready.pop(job.drive, None)
-        self._begun = [begun for begun in self._begun if begun is not job]
-        self._waiting = [waiting for waiting in self._waiting if waiting[2] is not job]
-        heapq.heapify(self._waiting)
+        self._forget_due(job)
         if job in self._round:
             at = self._round.index(job)
             self._next -= at < self._next
             self._round.pop(at)
+
+    def _forget_due(self, job: J) -> None:
+        """Forget when this job is due."""
+        self._begun = [begun for begun in self._begun if begun is not job]
+        self._waiting = [waiting for waiting in self._waiting if waiting[2] is not job]
+        heapq.heapify(self._waiting)
 
     def replace(self, jobs: Sequence[J], others: Sequence[J], due_ns: int) -> None:
         """Replace `jobs` by `others` at the same place in the order; `others` are first due at `due_ns`."""
@@ -423,9 +427,7 @@ class Schedule(Generic[J]):
             if turn.due_ns is None:
                 self.go_on(job)
                 continue
-            self._begun = [begun for begun in self._begun if begun is not job]
-            self._waiting = [waiting for waiting in self._waiting if waiting[2] is not job]
-            heapq.heapify(self._waiting)
+            self._forget_due(job)
             job.due_ns, job.taken_ns = turn.due_ns, 0
             self._await(job)
 
