@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import checksums
 import pytest
+from profile_families import shipped
 from scripts import Wire, frame, rows, typed
 from simulated_bus import one
 from tables import table
@@ -223,6 +224,15 @@ def test_innovert_ibd_start_is_refused_with_a_fault_or_wrong_settings(
     with pytest.raises(WriteForbidden, match=sentence):
         wire.drive.start()
     assert wire.sent == []
+
+
+def test_start_of_a_sibling_with_a_fault_register_names_the_fault() -> None:
+    line, drive, sim = one(shipped("innovert-idd-mini-plus", 1))
+    drive.set_frequency(20)
+    sim.motor.fault = 4
+    with pytest.raises(WriteForbidden, match=r"has a fault, 4: .*reset_fault\(\)"):
+        drive.start()
+    assert not [request for request, _ in line.frames if request.function == 6 and request.start == 0x2000]
 
 
 def test_innovert_ibd_identity_check_compares_address_and_baud_rate() -> None:
