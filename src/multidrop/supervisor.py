@@ -148,14 +148,17 @@ class Supervisor:
 
         def run(call: Callable[[Callable[[], R]], R]) -> None:
             settle: partial[None]
+            failure = None
             try:
                 settle = partial(future.set_result, call(work))
-            except BaseException as failure:
-                settle = partial(future.set_exception, for_a_future(failure))
+            except BaseException as raised:
+                failure = for_a_future(raised)
+                settle = partial(future.set_exception, failure)
             try:
                 loop.call_soon_threadsafe(finish, settle)
             except RuntimeError:  # the event loop was closed while the thread worked
-                _log.warning("%s ended after the gateway: %s", name, settle.args[0])
+                if failure is not None:
+                    _log.warning("%s failed after the end of the gateway: %s", name, failure)
 
         thread = threading.Thread(
             target=run, args=[copy_context().run], name=f"multidrop {name}", daemon=True

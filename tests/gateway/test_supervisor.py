@@ -281,6 +281,29 @@ async def test_a_task_released_by_the_supervisor_is_not_reported_as_dead() -> No
     assert supervisor().dead == {}
 
 
+@pytest.mark.parametrize("failure", [None, OSError("the disk is broken")])
+def test_only_failed_work_is_logged_after_the_end_of_the_gateway(
+    failure: Exception | None, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The log has no handler then. Python would write to stderr, and wait for a reader that has halted."""
+    go_on = threading.Event()
+
+    def work() -> None:
+        go_on.wait(PATIENCE)
+        if failure is not None:
+            raise failure
+
+    async def begin() -> None:
+        supervisor().thread("history", PATIENCE, work)
+
+    asyncio.run(begin())
+    [thread] = [one for one in threading.enumerate() if one.name == "multidrop history"]
+    go_on.set()
+    thread.join(PATIENCE)
+    logged = ["history failed after the end of the gateway: the disk is broken"]
+    assert caplog.messages == (logged if failure else [])
+
+
 async def test_a_dead_task_is_no_longer_reported_after_a_new_start() -> None:
     await asyncio.wait([supervisor().keep("part", asyncio.sleep(0))])
     await asyncio.sleep(0)
