@@ -287,9 +287,7 @@ def _drive(table: Any, line: Mapping[str, Any], place: TomlPlace) -> PolledDrive
     if not is_right:  # a drive with mistakes only in `every`, `poll` and channels can still be stopped
         return None
     drive = place.attempt(partial(model, name=given["name"], **inherited, **arguments))
-    if drive and place.attempt(partial(_on_port, drive, line["port"])) is None:
-        return None
-    if drive is None:
+    if drive is None or place.attempt(partial(_on_port, drive, line["port"])) is None:
         return None
     polled = partial(PolledDrive, drive, channels=tuple(filter(None, channels)))
     return place.attempt(polled, polls, key="poll") or polled([])
