@@ -262,13 +262,6 @@ class Bus:
             self._attached.remove(drive)
             self._writer.identity_check.forget(drive)
 
-    def remember(self, before: Bus) -> None:
-        """Take over the drives' response delays and unanswered requests from a closed bus on the same line.
-
-        The new bus must know the unanswered requests, because late replies to them may still arrive.
-        """
-        self._exchanges.peers.remember(before._exchanges.peers)
-
     def peer(self, drive: Drive) -> Peer:
         """Return the Peer of a drive: its learnt response delay and its late replies. Raises NotAttached."""
         return self._exchanges.peers.of(drive)

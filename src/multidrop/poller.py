@@ -290,17 +290,18 @@ class Poller(RowSource):
         A mistake in the plant raises ValueError and changes nothing: PlantError with all mistakes, NoSuchPort
         for an invalid port name, OSError for an audit log that cannot be opened.
 
-        An unchanged line keeps its polling times. An unchanged drive stays the same object, and the library
-        still knows its identity and its unanswered requests. Changed registers, rates and drives take effect
-        on the open port, if the line keeps its port. All other lines are closed and opened again. A port that
-        cannot be opened is tried again like a lost one. The plant overrides earlier calls of `add` and
-        `set_rate`.
+        An unchanged line keeps its polling times. A changed line closes its port and opens it again, usually
+        within half a second. Its stops in progress continue on the opened port; other calls in progress may
+        raise LineError or Unconfirmed. An unchanged drive stays the same object, and its late replies are
+        still recognised. A line with another port or other port options is removed, and a new line added. A
+        port that cannot be opened is tried again like a lost one. The plant overrides earlier calls of `add`
+        and `set_rate`.
 
         When lines and drives are removed, their requests in flight are completed and give rows. Other calls
         on a removed line raise LineError; calls of a removed drive raise NotAttached, or CancelledByStop if
-        they move its motor. This call waits for pending stops. Motors continue as they are, unless
-        `stop_on_exit` is set: then the drives are stopped before they are removed. A drive whose address
-        becomes another family's is not stopped, because its stop may mean something else there.
+        they move its motor. This call waits for the pending stops of removed drives. Motors continue as they
+        are, unless `stop_on_exit` is set: then the drives are stopped before they are removed. A drive whose
+        address becomes another family's is not stopped, because its stop may mean something else there.
 
         In batches, names keep their codes. The call returns when the change is complete; other lines are
         polled meanwhile. Any thread may call this; calls run one after another.

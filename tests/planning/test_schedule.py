@@ -447,13 +447,6 @@ def test_a_new_poll_gets_the_place_and_due_time_of_the_replaced_one() -> None:
     assert set(made.jobs) == {jobs[1], both, one, other, slower}
 
 
-def test_a_new_order_of_drives_starts_with_the_first_drive() -> None:
-    made = schedule(*(jobs := [job(drive) for drive in range(3)]))
-    assert take(made, 0, 1) == [(jobs[0], 0)]
-    made.put_in_order([2, 1, 0])
-    assert [asked for asked, _ in take(made, 100, 15)] == [jobs[2], jobs[1], jobs[0]]
-
-
 def test_a_poll_without_a_period_gets_the_place_of_the_replaced_one() -> None:
     made = schedule(*(jobs := [job(drive) for drive in range(3)]))
     assert take(made, 0, 1) == [(jobs[0], 0)]

@@ -133,7 +133,7 @@ def test_a_change_to_an_equal_plant_keeps_drive_objects_and_ports() -> None:
 
 
 @pytest.mark.slow
-def test_rates_and_registers_can_be_changed_without_reopening_the_port() -> None:
+def test_a_change_of_rates_and_registers_keeps_the_drives() -> None:
     with clocked(hall(*pumps())) as made:
         made.run(2)
         first, second = made.poller.bus("hall").drives
@@ -149,7 +149,6 @@ def test_rates_and_registers_can_be_changed_without_reopening_the_port() -> None
         made.poller.adopt(plant(hall(*pumps())))
         check_rates(made, pump_1=0.1, pump_2=0.1)
         assert made.poller.bus("hall").drives == [first, second]
-        assert made.opened == ["port of hall"]
 
 
 @pytest.mark.slow
@@ -166,7 +165,6 @@ def test_a_new_plant_adds_and_removes_drives_and_changes_addresses() -> None:
             found = {row.value for row in rows if row.drive == name and row.register == "output_current"}
             assert found == {proof(Toy(address), CURRENT)}
         assert made.poller.bus("hall").drives[0] is stays
-        assert made.opened == ["port of hall"]
 
 
 @pytest.mark.slow
@@ -189,15 +187,16 @@ def test_a_drive_can_be_replaced_by_one_of_another_family() -> None:
 
 
 @pytest.mark.slow
-def test_the_port_of_a_renamed_line_stays_open() -> None:
+def test_a_renamed_line_keeps_its_bus_and_its_drives() -> None:
     with clocked(hall(*pumps()), yard(*fans())) as made:
         made.run(2)
+        before = made.poller.buses
         names = replace(hall(*pumps()), name="yard"), replace(yard(*fans()), name="hall")
         assert made.poller.adopt(plant(*names)) == {}
         check_rates(made, 0, pump_1=0.1)
         assert list(made.poller.statistics()) == ["yard", "hall"]
         assert [drive.name for drive in made.poller.bus("hall").drives] == ["fan-1", "fan-2"]
-        assert sorted(made.opened) == ["port of hall", "port of yard"]
+        assert made.poller.buses == {"yard": before["hall"], "hall": before["yard"]}
 
 
 @pytest.mark.long
@@ -294,28 +293,27 @@ def test_the_cost_of_adding_a_line_grows_linearly_with_the_lines() -> None:
 
 
 def test_late_replies_are_still_expected_after_a_new_plant_reopens_a_port() -> None:
-    """The late reply may arrive after the port is reopened, so the bus must remember it."""
+    """The port options change too, so the line gets a new bus, with new records of its drives."""
     wires = {"port of hall": wire(Toy(1))}
     with ClockedLines.of_lines(wires, plant(hall(toy("pump-1", 1), toy("gone", 5)))) as made:
         made.run(2)
         ours = made.poller.bus("hall")
-        peers = [ours.peer(drive) for drive in ours.drives]
-        assert peers[1].late_until_ns > 0
+        late_until_ns = [ours.peer(drive).late_until_ns for drive in ours.drives]
+        assert late_until_ns[1] > 0
         made.poller.adopt(plant(replace(hall(toy("pump-1", 1), toy("gone", 5)), echo=Echo.OFF)))
         now = made.poller.bus("hall")
         assert now is not ours
-        assert [now.peer(drive) for drive in now.drives] == peers
+        assert [now.peer(drive).late_until_ns for drive in now.drives] == late_until_ns
         check_rates(made, pump_1=0.1)
 
 
 def test_a_new_drive_expects_late_replies_of_the_drive_that_it_replaces() -> None:
-    """The old drive's queued requests are sent first. The new drive then knows which late replies are due."""
+    """The new drive is attached once the old drive's last request has ended."""
     wires = {"port of hall": wire(Toy(1))}
     with ClockedLines.of_lines(wires, plant(hall(toy("pump-1", 1), toy("deaf", 5, 0.05)))) as made:
         made.run(0.2)
         ours = made.poller.bus("hall")
         before = ours.peer(ours.drives[1])
-        exchanges = before.exchanges
         adopting = made.beside(
             lambda: made.poller.adopt(plant(hall(toy("pump-1", 1), polled(InvtCHE(5, name="new"), [], None))))
         )
@@ -323,7 +321,6 @@ def test_a_new_drive_expects_late_replies_of_the_drive_that_it_replaces() -> Non
         made.finish(adopting)
         new = ours.peer(ours.drives[1])
         assert new is not before
-        assert before.exchanges > exchanges
         assert new.late_until_ns == before.late_until_ns > 0
 
 
@@ -474,12 +471,10 @@ def test_rows_are_distinguished_by_time_if_drives_swap_names() -> None:
 
     with ClockedLines.of_lines(wires, named("a", "b", "c")) as made:
         rows = made.run(1)
-        begun_ns = made.poller.polled_since
         adopting = made.beside(lambda: made.poller.adopt(named("b", "c", "a")))
         rows += made.run(2)
         made.finish(adopting)
         since_ns = made.poller.polled_since
-    assert since_ns["stays"] == begun_ns["stays"]
     before = {"a": 1, "b": 2, "c": 5, "stays": 6}
     after = {"a": 5, "b": 1, "c": 2, "stays": 6}
     told = {
@@ -531,64 +526,3 @@ def test_a_drive_name_keeps_its_code_in_all_batches() -> None:
                 for code in set(columns.drive):
                     assert meant.setdefault(code, columns.drives[code]) == columns.drives[code]
         assert {"pump-1", "fan-1", "vent-1", "pump-2"} <= set(meant.values())
-
-
-@pytest.mark.long
-def test_memory_stays_bounded_if_the_plant_changes_often() -> None:
-    with clocked(hall(*pumps()), yard(*fans())) as made:
-
-        def kept() -> tuple[int, ...]:
-            lines = made.poller._lines
-            polled_line = lines.find("hall")
-            return (
-                len(polled_line._planned),
-                len(polled_line._maker._made),
-                len(polled_line._maker._rows),
-                len(lines._numbered),
-                len(lines._free),
-                max(lines._numbered),
-                len(polled_line.bus._exchanges.peers._known),
-                len(polled_line._gone),
-            )
-
-        def adopt_some(number: int) -> None:
-            swapped = toy(f"pump-{2 + number % 2}", 2 + number % 2, None if number % 3 else 0.1)
-            others = OTHERS[number % len(OTHERS)]
-            wanted = plant(hall(toy("pump-1", 1, 0.1 + number / 1000), swapped), *others)
-            adopting = made.beside(lambda: made.poller.adopt(wanted))
-            while adopting.is_alive():
-                made.run(0.05)
-
-        for number in range(30):
-            adopt_some(number)
-        before = kept()
-        for number in range(30, 90):
-            adopt_some(number)
-        after = kept()
-        assert all(now <= then + 2 for now, then in zip(after, before, strict=True)), (before, after)
-
-
-def test_added_drives_are_polled_with_the_fewest_changes_of_baud_rate() -> None:
-    """The polling order is the same as if all drives had been polled from the start."""
-
-    def drives() -> list[PolledDrive]:
-        rates = {1: 9600, 2: 19200, 3: 9600, 4: 19200}
-        return [polled(Toy(at, name=f"p-{at}", baudrate=rates[at]), [CURRENT]) for at in rates]
-
-    def round_of(made: ClockedLines) -> list[str]:
-        return [job.owner.name for job in made.poller._lines.find("hall")._schedule._round]
-
-    def quick() -> ClockedWire:
-        return wire(*(each.drive for each in drives()))
-
-    with ClockedLines.of_lines({"port of hall": quick()}, plant(hall(*drives()))) as made:
-        at_start = round_of(made)
-    with ClockedLines.of_lines({"port of hall": quick()}, plant(hall(*drives()[:1]))) as made:
-        made.run(1)
-        made.poller.adopt(plant(hall(*drives())))
-        joined = round_of(made)
-        rows = made.run(3)
-    assert sorted(joined) == sorted(at_start)
-    assert joined == at_start
-    assert joined != [each.drive.name for each in drives()]
-    assert {name for name, _ in values(rows)} == {"p-1", "p-2", "p-3", "p-4"}

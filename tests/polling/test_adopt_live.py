@@ -10,7 +10,6 @@ import tracemalloc
 from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 from commands import descriptors, threads
@@ -18,115 +17,29 @@ from lines import PATIENCE, line, plant, polled, until
 from serial.urlhandler import protocol_socket
 from tables import examples
 from toy import QuickToy, Toy
+from two_lines import (
+    CURRENT,
+    Blocked,
+    TwoLines,
+    note_writes,
+    quick,
+    runs,
+    samples,
+    until_sampled,
+)
 
 from multidrop.bus import Bus
 from multidrop.control.outcome import Seen, Stopped
 from multidrop.drive import Drive
-from multidrop.errors import CancelledByStop, LineError, NoReply, NotAttached
+from multidrop.errors import CancelledByStop, LineError, NoReply, NotAttached, PortLost
 from multidrop.plant.model import PlantLine, PolledDrive
 from multidrop.poller import Poller
-from multidrop.sim import SimulatedDrive, Simulator, Wire, simulated
-
-CURRENT, STATUS = Toy.registers["output_current"], Toy.registers["status"]
-
-
-class TwoLines:
-    """Two lines with two simulated drives each."""
-
-    def __init__(self, port: str = "pty") -> None:
-        self.pumps, self.fans = (
-            {address: simulated(QuickToy(address)) for address in (1, 2)} for _ in ("hall", "yard")
-        )
-        self.simulator = Simulator(
-            [Wire([*drives.values()], unpaced=True, port=port) for drives in (self.pumps, self.fans)]
-        )
-
-    def __enter__(self) -> TwoLines:
-        self.simulator.__enter__()
-        return self
-
-    def __exit__(self, *failure: object) -> None:
-        self.simulator.__exit__(None, None, None)
-
-    def hall(self, *addresses: int, every: float | None = 0.02) -> PlantLine:
-        return self._line(0, "hall", "pump", addresses, every)
-
-    def yard(self, *addresses: int, every: float | None = 0.02) -> PlantLine:
-        return self._line(1, "yard", "fan", addresses, every)
-
-    def _line(
-        self, number: int, name: str, drive: str, addresses: tuple[int, ...], every: float | None
-    ) -> PlantLine:
-        drives = [quick(f"{drive}-{address}", address, every) for address in addresses or (1, 2)]
-        return line(self.simulator.wires[number].path, *drives, name=name)
-
-
-def quick(name: str, address: int, every: float | None = 0.02) -> PolledDrive:
-    return polled(QuickToy(address, name=name), [CURRENT, STATUS], every)
 
 
 @pytest.fixture
 def both() -> Iterator[TwoLines]:
     with TwoLines() as made:
         yield made
-
-
-def samples(poller: Poller, drive: str) -> int:
-    return sum(
-        figures.samples
-        for each in poller.statistics().values()
-        for name, figures in each.drives.items()
-        if name == drive
-    )
-
-
-def runs(drive: SimulatedDrive) -> bool:
-    return drive["control"] == 1
-
-
-class Blocked:
-    """Blocks calls until its `with` block ends, and then waits for the threads that `start` has started."""
-
-    def __init__(self) -> None:
-        self._reached, self._go_on = threading.Event(), threading.Event()
-        self._threads: list[threading.Thread] = []
-
-    def __enter__(self) -> Blocked:
-        return self
-
-    def __exit__(self, *failure: object) -> None:
-        self._go_on.set()
-        for thread in self._threads:
-            thread.join(PATIENCE)
-            assert not thread.is_alive()
-
-    def blocking(
-        self, act: Callable[..., Any], when: Callable[..., bool] = lambda *_: True
-    ) -> Callable[..., Any]:
-        """Return a function that calls `act`. If `when` is true, it first waits for the end of the block."""
-
-        def blocked(*arguments: Any, **details: Any) -> Any:
-            if when(*arguments):
-                self._reached.set()
-                assert self._go_on.wait(PATIENCE)
-            return act(*arguments, **details)
-
-        return blocked
-
-    def await_call(self) -> None:
-        """Wait until a call is blocked."""
-        assert self._reached.wait(PATIENCE)
-
-    @property
-    def is_blocking(self) -> bool:
-        """True if each thread is still alive."""
-        return all(thread.is_alive() for thread in self._threads)
-
-    def start(self, act: Callable[..., object], *arguments: object) -> threading.Thread:
-        """Call `act` on a new thread; return the thread."""
-        self._threads.append(threading.Thread(target=act, args=arguments))
-        self._threads[-1].start()
-        return self._threads[-1]
 
 
 def test_motors_keep_running_when_their_line_is_removed(both: TwoLines) -> None:
@@ -198,7 +111,7 @@ def test_no_stop_of_the_old_family_is_sent_after_a_family_change(both: TwoLines)
             poller.bus(name).drives[0].start()
         writes: list[int] = []
         for sim in (both.pumps[1], both.fans[1]):
-            _note_writes(sim, writes)
+            note_writes(sim, writes)
         other = polled(Other(1, name="pump-1"), [Other.registers["status"]], 0.02)
         yard = both.yard()
         reopened = PlantLine(
@@ -210,16 +123,6 @@ def test_no_stop_of_the_old_family_is_sent_after_a_family_change(both: TwoLines)
         assert runs(both.fans[1])
     assert not runs(both.pumps[1])  # stopped at exit, by the stop of its new family
     assert not runs(both.fans[1])
-
-
-def _note_writes(sim: SimulatedDrive, writes: list[int]) -> None:
-    write = sim.write
-
-    def noted(function: int, start: int, values: list[int]) -> None:
-        writes.append(start)
-        write(function, start, values)
-
-    vars(sim)["write"] = noted
 
 
 def blocked_stop(
@@ -300,13 +203,12 @@ def test_a_drive_can_be_stopped_while_its_replacement_is_pending(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("is_circle", [False, True])
 def test_a_drive_can_be_stopped_while_its_renaming_is_pending(
-    both: TwoLines, monkeypatch: pytest.MonkeyPatch, is_circle: bool
+    both: TwoLines, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """While `adopt` waits for a stop on the other line, the drive's motor can still be stopped."""
     hall, yard = both.hall(1), both.yard(1)
-    names = ("fan-1", "pump-1" if is_circle else "fan-2")
+    names = ("fan-1", "pump-1")
     renamed = [
         line(each.port, quick(name, 1), name=each.name)
         for each, name in zip((hall, yard), names, strict=True)
@@ -479,40 +381,6 @@ def test_a_drive_can_be_stopped_while_a_port_opens(both: TwoLines, monkeypatch: 
         assert adopting.is_alive()
 
 
-def until_sampled(poller: Poller, drive: str) -> None:
-    until(lambda: samples(poller, drive) > 5)
-
-
-class Dawdling(dict[object, object]):
-    """A dict in which another thread makes a change while a caller iterates over the values."""
-
-    def __init__(self, of: dict[object, object], change: Callable[[], object]) -> None:
-        super().__init__(of)
-        self._changing = threading.Thread(target=change)
-
-    def values(self) -> Any:
-        for value in super().values():
-            if self._changing.ident is None:
-                self._changing.start()
-            self._changing.join(0.2)
-            yield value
-
-    def wait(self) -> None:
-        self._changing.join(PATIENCE)
-        assert not self._changing.is_alive()
-
-
-@pytest.mark.slow
-def test_a_summary_during_a_change_shows_the_old_or_the_new_plant(both: TwoLines) -> None:
-    with Poller(plant(both.hall())) as poller:
-        (polled_line,) = poller._lines
-        maker = polled_line._maker
-        maker._made = dawdling = Dawdling(maker._made, lambda: poller.adopt(plant(both.hall(1))))
-        assert set(poller.summary()["lines"]["hall"]["drives"]) == {"pump-1", "pump-2"}
-        dawdling.wait()
-        assert [drive.name for drive in poller.bus("hall").drives] == ["pump-1"]
-
-
 @pytest.mark.long
 @pytest.mark.slow
 def test_a_hundred_plant_changes_leak_no_threads_descriptors_or_memory(both: TwoLines) -> None:
@@ -537,7 +405,8 @@ def test_a_hundred_plant_changes_leak_no_threads_descriptors_or_memory(both: Two
             poller.summary(), poller.statistics(), poller.plant, repr(poller)
 
         def read_one() -> None:
-            with suppress(NoReply):  # possible on a busy computer
+            # a changed line closes its port for a moment; on a busy computer, a reply may be late
+            with suppress(PortLost, NoReply):
                 pump.read(CURRENT)
 
         def read_all() -> None:

@@ -59,6 +59,8 @@ with Simulator([Wire([simulated(Toy(1))])]) as sim:
             toy = bus.attach(Toy, 1)
             for _ in range(int(sys.argv[2])):
                 said.append(toy.read(toy.output_current))
+            bus.line.drop("the plant file was reloaded")
+            bus.line.regain()
             message = Message(0, 0x10, 0x15, 20, data=bytes(40))
             peer = Peer(least_timeout=0.1, most_timeout=0.1)
             settings = {"baudrate": 9600, "format": "8N1", "character": 10 / 9600, "silence": 0.004}
@@ -111,6 +113,7 @@ def test_rts_switches_only_while_sending(driver: Path, mode: str, sending: str, 
         before, write, after = events[at - 1 : at + 2]
         assert (before.what, after.what) == (sending, receiving)
         late.append(after.ns - write.ns - write.count * CHARACTER_NS)
+    assert [event.what for event in events].count(sending) == len(writes)  # not while the port is reopened
     assert 0 <= min(late) < 3.5 * CHARACTER_NS  # only the shortest delay: a busy computer prolongs others
     assert events[-1].what == receiving
     assert (
@@ -123,9 +126,9 @@ def test_the_drivers_rs485_mode_is_switched_on_with_its_configured_polarity(driv
     for flags in (ON_SEND, AFTER_SEND):
         read, events = play(driver, "kernel", 3, RS485_FLAGS=flags)
         assert len(read) == 3
-        assert [event.count for event in events if event.what == "mode"] == [flags | ENABLED]
+        assert [event.count for event in events if event.what == "mode"] == [flags | ENABLED] * 2
     _, events = play(driver, "kernel", 1, RS485_FLAGS=0)
-    assert [event.count for event in events if event.what == "mode"] == [ON_SEND | ENABLED]
+    assert [event.count for event in events if event.what == "mode"] == [ON_SEND | ENABLED] * 2
 
 
 @pytest.mark.long

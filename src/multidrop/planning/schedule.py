@@ -263,12 +263,6 @@ class Schedule(Generic[J]):
         for job in jobs:
             self.remove(job)
 
-    def put_in_order(self, drives: Sequence[int]) -> None:
-        """Sort the jobs without a period by the given order of drives, and start a new round."""
-        places = {drive: place for place, drive in enumerate(drives)}
-        self._round.sort(key=lambda job: places[job.drive])
-        self._next = 0
-
     def _await(self, job: J) -> None:
         heapq.heappush(self._waiting, (job.due_ns, job.number, job))
 

@@ -1,14 +1,14 @@
 """Adoption: change the lines of a poller to those of another plant, while the lines are polled.
 
-All mistakes are found before anything changes. Then lines and drives are removed, kept lines are changed, and
-new ports are opened. Lines without changes are not touched.
+All mistakes are found before anything changes. Then lines are removed, each changed line closes its port and
+opens it again, and new lines are opened. Lines without changes are not touched.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -98,25 +98,25 @@ def _description(drive: Drive) -> tuple[object, ...]:
 GONE = "its line is no longer polled"
 
 
-class KeptLine:
-    """A line that keeps its open port, with its new description and the changes of its drives."""
+class ChangedLine:
+    """A present line and its new description. Its bus stays, and so do its drives without changes."""
 
     def __init__(self, line: PolledLine, wanted: PlantLine) -> None:
         self.line = line
-        self.wanted = wanted
-        self.joining: list[PolledDrive] = []
-        self._repolled: list[PolledDrive] = []  # drives that stay, with other registers or rates
-        left = list(line.polled)
-        for polled in wanted.drives:
-            description = _description(polled.drive)
-            same = next((each for each in left if _description(each.drive) == description), None)
-            if same is None:
-                self.joining.append(polled)
-                continue
-            left.remove(same)
-            if (same.polls, same.channels) != (polled.polls, polled.channels):
-                self._repolled.append(PolledDrive(same.drive, polled.polls, channels=polled.channels))
-        self.leaving = [polled.drive for polled in left]
+        there = {drive.address: drive for drive in line.bus.drives}
+
+        def known(drive: Drive) -> Drive:
+            same = there.get(drive.address, drive)
+            return same if _description(same) == _description(drive) else drive
+
+        drives = [PolledDrive(known(one.drive), one.polls, channels=one.channels) for one in wanted.drives]
+        self.wanted = replace(wanted, drives=drives)
+        staying, polled = ({one.drive for one in some} for some in (drives, line.polled))
+        taken = {drive.address for drive in staying - {*line.bus.drives}}
+        # a program's own drives on the bus stay there, unless their address is taken
+        leaving = [drive for drive in there.values() if drive in polled or drive.address in taken]
+        self.leaving = [drive for drive in leaving if drive not in staying]
+        self._to_stop = [drive for drive in self.leaving if drive.address not in taken]
 
     def await_stops(self) -> None:
         """Cancel the calls of the drives that leave the line, and wait for their stops.
@@ -125,42 +125,11 @@ class KeptLine:
         drive gets its address: its stop could be a different command to the new drive. Drives are removed
         only after all stops have ended. Until then, every drive can be stopped again.
         """
-        taken = {polled.drive.address for polled in self.joining}
-        self.line.bus.part_with(self.leaving, [one for one in self.leaving if one.address not in taken])
+        self.line.bus.part_with(self.leaving, self._to_stop)
 
-    def let_leave(self, names: Collection[str]) -> None:
-        """Remove the leaving drives; if a drive's name is in `names`, also wait for its last exchange."""
+    def let_leave(self) -> None:
         for drive in self.leaving:
             self.line.remove(drive)
-            self.line.forget(drive)
-        for drive in self.leaving:
-            if drive.name in names:
-                self.line.await_gone(drive.address)
-
-    def is_free(self, leaving: Mapping[str, KeptLine]) -> bool:
-        """Return True if no drive on another line still has the name of a drive that this line gets."""
-        return all(leaving.get(polled.drive.name, self) is self for polled in self.joining)
-
-    def take_in(self) -> None:
-        """Start polling the line's new drives, and change the polled registers and rates of the others.
-
-        Raises LineError if the port does not support a drive's settings.
-        """
-        self.line.declared, self.line.switching = self.wanted, self.wanted.switching
-        for polled in self._repolled:
-            self.line.set_polls(polled)
-        for polled in self.joining:
-            self.line.add(polled)
-        if self.joining:
-            self.line.put_in_order()
-
-
-@dataclass(frozen=True)
-class NewLine:
-    """A line to open; `before` is the poller's present line on the same port, or None."""
-
-    wanted: PlantLine
-    before: PolledLine | None
 
 
 class Adoption:
@@ -182,28 +151,20 @@ class Adoption:
             for wanted in self._plant.lines
             if (line := named.get(wanted.name)) and _can_become(line, wanted)
         }
-        taken = set(found.values())
-        ported: dict[str, list[PolledLine]] = {}
+        taken, ported = {*found.values()}, dict[str, list[PolledLine]]()
         for line in self._lines:
             if line not in taken:
                 ported.setdefault(line.declared.port, []).append(line)
-        new: list[NewLine] = []
         for wanted in self._plant.lines:
-            if wanted.name in found:
-                continue
-            others = ported.get(wanted.port, [])
-            same = next((line for line in others if _can_become(line, wanted)), None)
-            if same is not None:
+            others = [] if wanted.name in found else ported.get(wanted.port, [])
+            if same := next((line for line in others if _can_become(line, wanted)), None):
                 others.remove(same)
                 found[wanted.name] = same
-            else:
-                new.append(NewLine(wanted, others[0] if others and not speaks_tcp(wanted.port) else None))
-        self._kept = [
-            KeptLine(found[wanted.name], wanted) for wanted in self._plant.lines if wanted.name in found
-        ]
-        self._new = new
-        kept = set(found.values())
+        self._new = [wanted for wanted in self._plant.lines if wanted.name not in found]
+        kept = {*found.values()}
         self._removed = [line for line in self._lines if line not in kept]
+        pairs = [(found[wanted.name], wanted) for wanted in self._plant.lines if wanted.name in found]
+        self._changed = [ChangedLine(*pair) for pair in pairs if not _is_equal(*pair)]
 
     def _check(self) -> None:
         if len(self._plant.lines) > MOST_LINES:
@@ -212,7 +173,7 @@ class Adoption:
             )
         self._lines.names.check_room(self._plant.drives)
         for new in self._new:
-            self._lines.check_port(new.wanted.port)
+            self._lines.check_port(new.port)
         if self._new:
             self._lines.check_audit()
         if self._new and self._lines.stops_on_exit:
@@ -224,47 +185,35 @@ class Adoption:
         """Change the lines; with `start`, poll the new lines. Return the errors of ports, by line name."""
         self._let_go()
         # New ports are opened last, so that a slow port never delays the stop of a drive that is replaced.
-        failures = self._change() | self._open(start)
+        failures = self._change(start) | self._open(start)
         self._lines.put_in_order([line.name for line in self._plant.lines])
         return failures
 
     def _let_go(self) -> None:
-        wanted = {new.before: new.wanted for new in self._new if new.before}
+        """Remove lines. With `stop_on_exit`, their drives are stopped, unless another family takes over."""
+        wanted = {new.port: new for new in self._new if not speaks_tcp(new.port)}
         for line in self._removed:
             for drive in line.bus.drives:
-                if line in wanted and _is_another(drive, wanted[line]):
+                if (new := wanted.get(line.declared.port)) and _is_another(drive, new):
                     line.remove(drive)
         self._lines.let_go(self._removed, GONE)
 
-    def _change(self) -> dict[str, LineError]:
-        """Change the lines that keep their ports, one by one; return the errors of ports, by line name.
+    def _change(self, start: bool) -> dict[str, LineError]:
+        """Close the ports of the changed lines and open them again; return the errors of ports, by line name.
 
-        If a drive's name moves from one line to another, the line that it leaves is changed first. Lines that
-        wait for each other in a circle are changed together, after their stops have ended.
+        All leaving drives are removed first, because a drive's name may move from one line to another.
         """
-        failures: dict[str, LineError] = {}
-        names = {polled.drive.name for polled in self._plant.drives}
-        left: list[KeptLine] = []
-        for kept in self._kept:
-            if kept.leaving or kept.joining:
-                left.append(kept)
-            else:
-                kept.take_in()
-        while left:
-            leaving = {drive.name: kept for kept in left for drive in kept.leaving}
-            free = next((kept for kept in left if kept.is_free(leaving)), None)
-            together = [free] if free else left
-            for kept in together:
-                kept.await_stops()
-            for kept in together:
-                kept.let_leave(names)
-            for kept in together:
-                try:
-                    kept.take_in()
-                except LineError as failure:
-                    failures[kept.wanted.name] = failure
-            left = [kept for kept in left if kept not in together]
-        return failures
+        for changed in self._changed:
+            changed.await_stops()
+        for changed in self._changed:
+            changed.let_leave()
+        self._lines.pause([changed.line for changed in self._changed])
+        lines = [self._lines.replace(changed.line, changed.wanted) for changed in self._changed]
+        for line in lines:
+            line.reopen()
+            if start:
+                line.start()
+        return {line.name: failure for line in lines if (failure := line.await_reopening())}
 
     def _open(self, start: bool) -> dict[str, LineError]:
         """Open the new lines; return the errors of ports, by line name.
@@ -272,41 +221,39 @@ class Adoption:
         A line whose port cannot be opened is added too. The poller opens the port later, like a lost port.
         """
         failures: dict[str, LineError] = {}
-        for place, bus in self._lines.open([new.wanted for new in self._new]):
+        for place, bus in self._lines.open(self._new):
             new = self._new[place]
             if isinstance(bus, LineError):
-                failures[new.wanted.name] = bus
-                bus = self._lines.await_port(new.wanted)
+                failures[new.name] = bus
+                bus = self._lines.await_port(new)
             elif isinstance(bus, OSError):
                 raise bus
+            line = self._lines.add(replace(new, drives=()), bus)
             try:
-                self._put(new, bus, start)
-            except LineError as failure:
-                failures[new.wanted.name] = failure
-        return failures
-
-    def _put(self, new: NewLine, bus: Bus, start: bool) -> None:
-        """Add a line with this bus; if `start` is set, start to poll it.
-
-        Raises LineError if the port does not support a drive's settings.
-        """
-        if new.before:
-            bus.remember(new.before.bus)
-        line = self._lines.add(replace(new.wanted, drives=()), bus)
-        try:
-            for polled in new.wanted.drives:
-                line.add(polled)
-        finally:
+                for polled in new.drives:
+                    line.add(polled)
+            except LineError as failure:  # the port does not support a drive's settings
+                failures[new.name] = failure
             if start:
                 line.start()
+        return failures
 
 
 def _is_free(drive: Drive, buses: set[Bus]) -> bool:
     return drive.bus is None or drive.bus in buses or not drive.bus.is_open
 
 
+def _is_equal(line: PolledLine, wanted: PlantLine) -> bool:
+    """Return True if the new plant changes nothing on this line."""
+    drives, others = (
+        [(_description(each.drive), each.polls, each.channels) for each in some]
+        for some in (line.polled, wanted.drives)
+    )
+    return drives == others and replace(line.declared, drives=()) == replace(wanted, drives=())
+
+
 def _can_become(line: PolledLine, wanted: PlantLine) -> bool:
-    """Return True if the line can become the line `wanted` without reopening its port."""
+    """Return True if the line can become the line `wanted` with the same port and port options."""
     facts, others = (
         (each.port, each.echo, each.transaction, each.rs485, each.settle) for each in (line.declared, wanted)
     )

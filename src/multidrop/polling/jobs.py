@@ -121,11 +121,6 @@ class JobMaker:
                 del self._made[key]
                 self._skipped += job.skipped
 
-    def forget_drive(self, drive: Drive) -> None:
-        for key in [key for key in self._made if key[0] is drive]:
-            self._skipped += self._made.pop(key).skipped
-        self._rows = {key: rows for key, rows in self._rows.items() if key[0] is not drive}
-
     def make(
         self, drive: Drive, block: Block, period_ns: int | None, *, rows: RowLayout | None = None
     ) -> PolledJob:

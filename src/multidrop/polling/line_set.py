@@ -174,6 +174,14 @@ class LineSet:
             bus.stop_on_exit()
         return line
 
+    def replace(self, before: PolledLine, wanted: PlantLine) -> PolledLine:
+        """Put another line in the place of a paused one; its bus and its statistics continue."""
+        bus, number, since_ns = before.bus, before.number, before.started_ns
+        line = PolledLine(wanted, number, bus, self._row_queue, self.names, since_ns)
+        self._numbered[number] = line
+        self._lines = tuple(line if each is before else each for each in self._lines)
+        return line
+
     def put_in_order(self, names: Sequence[str]) -> None:
         """Sort the lines into the order of `names`."""
         places = {name: place for place, name in enumerate(names)}
@@ -223,6 +231,20 @@ class LineSet:
             line.leave()
         for line in lines:
             line.bus.part()  # waits for the stops, which need the open port
+        self._await_exchanges(lines)
+
+    def pause(self, lines: Sequence[PolledLine]) -> None:
+        """Stop polling these lines, wait up to ENDING_NS for polls in flight, and drop the ports.
+
+        Stops continue: a stop that needs the port opens it again.
+        """
+        for line in lines:
+            line.leave()
+        self._await_exchanges(lines)
+        for line in lines:
+            line.drop()
+
+    def _await_exchanges(self, lines: Sequence[PolledLine]) -> None:
         given_up_ns = clock.now_ns() + self._patience_ns()
         while sum(line.end() for line in lines) and clock.now_ns() < given_up_ns:
             clock.sleep(0.001)

@@ -32,13 +32,14 @@ _log = logging.getLogger("multidrop.polling")
 class Reopening:
     """Attempts to reopen a lost port, one at a time, in a thread: a slow port must not delay other lines.
 
-    After a successful attempt, `reopened` is called in that thread.
+    After a successful attempt, `reopened` is called in that thread. `failure` is the last attempt's error.
     """
 
     def __init__(self, bus: Bus, reopened: Callable[[], object]) -> None:
         self._bus = bus
         self._reopened = reopened
         self._thread: threading.Thread | None = None
+        self.failure: LineError | None = None
 
     @property
     def is_under_way(self) -> bool:
@@ -61,11 +62,12 @@ class Reopening:
             self._thread.join()
 
     def _attempt(self) -> None:
+        self.failure = None
         try:
             self._bus.line.regain()
             self._reopened()
-        except LineError:
-            pass  # the line has logged the failure
+        except LineError as failure:
+            self.failure = failure  # the line has logged it
         except BaseException as failure:
             log_aside(
                 _log, logging.ERROR, "%s: not opened again\n%s", self._bus.line.port, traceback_of(failure)
@@ -129,13 +131,19 @@ class PolledLine:
     """
 
     def __init__(
-        self, declared: PlantLine, number: int, bus: Bus, row_queue: RowQueue, names: RowNames
+        self,
+        declared: PlantLine,
+        number: int,
+        bus: Bus,
+        row_queue: RowQueue,
+        names: RowNames,
+        started_ns: int = 0,
     ) -> None:
         self.declared = declared  # the line as declared; `polled` has the drives that are on it now
         self.bus = bus
         # s; duration of a change of the line's settings: declared, or measured at `end`
         self.switching = declared.switching
-        self.started_ns = clock.now_ns()
+        self.started_ns = started_ns  # when polling started, also before a change of the line; 0: not yet
         self.number = number
         self._is_left = False  # whether `leave` was called
         self._ended_ns: int | None = None  # monotonic time at which polling ended
@@ -145,7 +153,7 @@ class PolledLine:
         self._maker = JobMaker(bus, names)
         self._queue = PortQueue(self._schedule)
         self._refusals = Refusals(self._schedule, self._maker)
-        # plans of the drives; those of removed drives stay until `forget` is called
+        # plans of the drives; those of removed drives stay, in case the drives are added again
         self._planned: dict[PolledDrive, PlannedJobs] = {}
         self._present: dict[Drive, PolledDrive] = {}  # the drives on the line
         self._since_ns: dict[Drive, int] = {}  # when each drive's polls were last changed
@@ -172,12 +180,8 @@ class PolledLine:
         # protects all attributes above, because any thread may add and remove drives
         self._lock = threading.Lock()
         register_at_fork(self)
-        try:
-            for polled in declared.drives:
-                self.add(polled)
-        except BaseException:
-            self.bus.close()
-            raise
+        for polled in declared.drives:
+            self.add(polled)
 
     def forked(self) -> None:
         self._lock = threading.Lock()
@@ -201,8 +205,9 @@ class PolledLine:
     def add(self, polled: PolledDrive) -> None:
         """Start polling a drive. A drive that was polled before gets the same jobs again.
 
-        If another drive was removed from this address, first wait for the end of its last exchange. Only then
-        is it known whether a late reply of that drive may still come.
+        A drive that is on the bus stays attached. If another drive was removed from this address, first wait
+        for the end of its last exchange. Only then is it known whether a late reply of that drive may still
+        come.
         """
         polled.drive.take_settings(self.declared.baudrate, self.declared.format)
         self.await_gone(polled.drive.address)
@@ -210,7 +215,9 @@ class PolledLine:
         settings = polled.drive.settings
         self.bus.line.require((settings.baudrate, settings.format))
         with self._lock:
-            drive = self.bus.attach(polled.drive)
+            drive = polled.drive
+            if drive.bus is not self.bus:
+                self.bus.attach(drive)
             try:
                 if polled not in self._planned:
                     self._planned[polled] = self._maker.plan(polled, drive.response_delay)
@@ -236,13 +243,6 @@ class PolledLine:
     def _jobs(self, drive: Drive) -> list[PolledJob]:
         return [job for job in self._schedule.jobs if job.owner is drive]
 
-    def put_in_order(self) -> None:
-        """Sort the polled drives so that changes of the line's settings take the least time."""
-        with self._lock:
-            ordered = in_order(self.bus.drives, self.switching)
-            self._schedule.put_in_order([drive.address for drive in ordered])
-        self._row_queue.call(self.number)
-
     def await_gone(self, address: int) -> None:
         """Wait for the last exchange of a drive that was removed from this address."""
         peer = self._gone.pop(address, None)
@@ -266,12 +266,6 @@ class PolledLine:
         self.bus.detach(drive)
         self._row_queue.call(self.number)
 
-    def forget(self, drive: Drive) -> None:
-        """Forget the jobs of a removed drive. Its measured delays are kept; its late replies are awaited."""
-        with self._lock:
-            self._planned = {each: jobs for each, jobs in self._planned.items() if each.drive is not drive}
-            self._maker.forget_drive(drive)
-
     def set_rate(self, drive: Drive, register: Register[Any] | None, every: float | None) -> None:
         """Set the period `every` in s of a polled register, or of all polled registers if `register` is None.
 
@@ -279,14 +273,8 @@ class PolledLine:
         times. Registers with a new rate are polled now. Raises ValueError for a register that is not polled.
         """
         with self._lock:
-            after = self._present[drive].at_rate(register, every)
-        self.set_polls(after)
-
-    def set_polls(self, after: PolledDrive) -> None:
-        """Change a drive's polled registers or rates; the other registers are polled at the planned times."""
-        with self._lock:
-            drive = after.drive
             before = self._present[drive]
+            after = before.at_rate(register, every)
             if after == before:
                 return
             peer, now = self.bus.peer(drive), clock.now_ns()
@@ -330,11 +318,13 @@ class PolledLine:
 
     def start(self) -> None:
         with self._lock:
-            self.started_ns = clock.now_ns()
-            self.bus.reset_statistics()
+            now = clock.now_ns()
+            if not self.started_ns:
+                self.started_ns = now
+                self.bus.reset_statistics()
             polled = [polled.drive for polled in self.polled]
             for drive in in_order(polled, self.switching):
-                self._schedule_jobs(drive, self.started_ns)
+                self._schedule_jobs(drive, now)
             self._is_started = True
         self._row_queue.call(self.number)
 
@@ -519,14 +509,23 @@ class PolledLine:
         self._tried_ns, self._reopen_ns = now_ns, now_ns + REOPEN_NS
         self._reopening.begin()
 
+    def reopen(self) -> None:
+        """Start to open the port again, unless this process may not send on the line."""
+        if self.bus.line.may_send:
+            self._reopening.begin()
+
+    def await_reopening(self) -> LineError | None:
+        """Wait until the port is open, or the attempt to open it has failed; return the failure or None."""
+        self._reopening.join()
+        return self._reopening.failure
+
     def leave(self) -> None:
         """Make `tend` do nothing from now on. A lost port is then only reopened to send a stop."""
         with self._lock:
             self._is_left = True
 
     def end(self) -> bool:
-        """Stop polling and reopening; return True while an exchange is still in flight."""
-        self._reopening.join()
+        """Start no more polls; return True while one is in flight. Stops and other calls are still sent."""
         self._ended_ns = self._ended_ns or clock.now_ns()
         if port := self.bus.line.queue:
             self.switching = port.switching
@@ -537,21 +536,31 @@ class PolledLine:
 
         Later calls on the bus fail; `why` is part of their error sentence.
         """
+        self._reopening.join()
         self.bus.line.why_closing = why
         self.bus.line.ended_ns = self._ended_ns
         with self._lock:
             try:
-                self._miss_unsent(self._ended_ns or clock.now_ns())
-                self._over_ns = self._over_ns or clock.now_ns()
-                self._schedule.clear()
+                self._conclude(self.bus.line.queue)
             finally:
                 self.bus.close()
 
-    def _miss_unsent(self, ended_ns: int) -> None:
+    def drop(self) -> None:
+        """Conclude polling, and end all exchanges on the port. The next stop or `regain` opens it again."""
+        with self._lock:
+            port = self.bus.line.queue
+            self.bus.line.drop("it is being opened again, because its line was changed")
+            self._conclude(port)
+
+    def _conclude(self, port: Port | None) -> None:
+        self._miss_unsent(port, self._ended_ns or clock.now_ns())
+        self._over_ns = self._over_ns or clock.now_ns()
+        self._schedule.clear()
+
+    def _miss_unsent(self, port: Port | None, ended_ns: int) -> None:
         if self._is_broken:
             self._queue.abandon()
         self._miss_unasked(ended_ns)
-        port = self.bus.line.queue
         if port:
             port.stop()
             self._queue.conclude(port)
@@ -564,7 +573,8 @@ class PolledLine:
 
     def summary(self) -> dict[str, Any]:
         with self._lock:
-            seconds = max(((self._over_ns or clock.now_ns()) - self.started_ns) / 1e9, 1e-9)
+            now_ns = self._over_ns or clock.now_ns()
+            seconds = max((now_ns - (self.started_ns or now_ns)) / 1e9, 1e-9)
             line, peers = self.bus.line, {drive.name: peer for drive, peer in self.bus.peers.items()}
             return {
                 **line_summary(seconds, peers),

@@ -132,10 +132,6 @@ class Peers:
     def _names(self) -> set[str]:
         return identities_of(self._line.identity, self._line.port)
 
-    def remember(self, before: Peers) -> None:
-        """Take over the records of all present and removed drives of an earlier bus on the same line."""
-        self._known.update(before._known)
-
     def remove(self, drive: Drive) -> None:
         """Remove a drive from the line, but keep its record."""
         del self.present[drive]

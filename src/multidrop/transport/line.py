@@ -212,7 +212,6 @@ class Line:
             self.reopen()
 
     def _open(self) -> None:
-        self._why_closed = "it is closed"
         self._is_over = False
         if not self.may_send:
             raise LineError(self.port, UNOPENED)
@@ -231,15 +230,22 @@ class Line:
             self._let_go()
             raise LineError(self.port, reason_of(failure)) from None
 
-    def drop(self) -> None:
-        """End all exchanges and discard queued ones, without closing the port."""
+    def drop(self, why: str = "it is closed") -> None:
+        """End all exchanges and discard queued ones, without closing the port. Later calls raise PortLost.
+
+        `why` is the reason in their error sentence.
+        """
+        if self.queue is None:  # checked before the lock, which an attempt to reopen the port may hold
+            return
         with self._lock:
             core, self.queue = self.queue, None
             if core is None:
                 return
+            self._why_closed = why
             if core.lost:
-                self._why_lost = f"the port was lost ({(why := why_lost(self.port, core.lost_error))})"
-                self._log.lost(why)
+                lost = why_lost(self.port, core.lost_error)
+                self._why_lost = self._why_closed = f"the port was lost ({lost})"
+                self._log.lost(lost)
             core.stop()
             self._foreign += core.foreign
             self._opened.must_discard |= bool(core.called_off)
@@ -262,6 +268,8 @@ class Line:
 
     def end(self) -> bool:
         """Start no more queued exchanges. Return True while a queued exchange is in flight."""
+        if self.queue is None:  # checked before the lock, which an attempt to reopen the port may hold
+            return False
         with self._lock:  # held, because otherwise another thread could free the port
             return self.queue is not None and self.queue.end()
 
@@ -402,7 +410,7 @@ class Line:
     def _failure(self, found: Completion, exchange: Exchange, core: Port) -> LineError:
         if found.result == Failure.SETTINGS_REFUSED:
             return LineError(self.port, self._opened.refusal(found.error, exchange.settings[0]))
-        if self.queue is None or self.why_closing:
+        if self.queue is not core or self.why_closing:  # another thread has dropped the port
             return self._closed()
         why = why_lost(self.port, found.error, found.raw)
         if found.error == errno.ETIMEDOUT and not core.lost:

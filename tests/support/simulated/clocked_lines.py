@@ -269,6 +269,9 @@ class ClockedLine:
         if self.queue:
             self.queue = self._clocked.ports[self.port] = None
 
+    def drop(self, why: str) -> None:
+        self.drop_lost()
+
     close = drop_lost
 
     def reopen(self) -> None:
@@ -414,7 +417,8 @@ class ClockedLines:
     def _pass_time(self, seconds: float) -> None:
         for thread in threading.enumerate():
             # wait for this thread, which reopens a port: on the simulated clock this takes no time
-            if thread.name == "multidrop reopening":
+            # a thread that is being started is listed too, and cannot be joined yet
+            if thread.name == "multidrop reopening" and thread.is_alive():
                 thread.join()
         try:
             with self._turn:
