@@ -362,7 +362,10 @@ def test_only_one_of_nine_coast_commands_is_repeated_to_a_silent_drive(
         calls = [callers.submit(gateway.post, "/api/act", coast)]
         until(lambda: "pump-1" in gateway.gateway.bus("hall").stops_under_way())
         calls += [callers.submit(gateway.post, "/api/act", coast) for _ in range(8)]
-        until(lambda: gateway.gateway.commands.stops["pump-1"] == 9)
+        stops = gateway.gateway.commands._repeated["coast"]
+        # If the repeated command succeeded before all others have failed, it would be repeated again.
+        until(lambda: len(stops._tasks) == 8 and not stops._sent and not stops._waiting)
+        assert gateway.gateway.commands.stops["pump-1"] == 9
         gateway.sims["pump-1"].deaf_until = 0.0
         assert [call.result().json["done"] for call in calls] == [True] * 9
     assert repeated.count(None) == 1
