@@ -8,6 +8,7 @@ import math
 import struct
 import time
 from collections.abc import Awaitable, Callable
+from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -21,7 +22,8 @@ from tables import table
 
 from multidrop import Bus, InvtCHE, Plant
 from multidrop.channels import Channel
-from multidrop.control import CommandResult, Ledger
+from multidrop.control import CommandOutcome, CommandResult, Ledger
+from multidrop.gateway import commands as commands_module
 from multidrop.gateway.commands import Commands
 from multidrop.gateway.http.rights import Caller, May, Right
 from multidrop.gateway.live.hub import Hub, published_values
@@ -30,6 +32,7 @@ from multidrop.gateway.modbus_server.settings import ModbusSettings
 from multidrop.plant.model import PlantLine, PolledDrive
 
 CALLER = Caller("anna", "http", "10.0.0.7", Right.WRITE)
+DONE = CommandResult(CommandOutcome.DONE, "done")
 MAY = May(write=frozenset({"mill.setpoint"}), verbs=frozenset({"mill.start"}))
 
 
@@ -66,6 +69,27 @@ def test_the_end_time_of_the_last_command_to_a_drive_is_stored(command: Callable
     begun_ns = time.monotonic_ns()
     asyncio.run(command(commands))
     assert begun_ns <= commands.ended_ns("mill") <= time.monotonic_ns()
+
+
+async def test_a_pause_between_two_clock_reads_never_makes_the_deadline_of_a_write_later(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Here both clocks show the same time, and the process is suspended for a second before each read."""
+    times = count(0, 10**9)
+    deadlines: list[float] = []
+
+    def begin(work: object, limit_ns: Callable[[], float], why_not: object) -> Any:
+        deadlines.append(limit_ns())
+        return asyncio.get_running_loop().create_task(asyncio.sleep(0, DONE))
+
+    for clock in ("now_ns", "boottime_ns"):
+        monkeypatch.setattr(commands_module, clock, lambda: next(times))
+    monkeypatch.setattr(commands_module, "begin_command", begin)
+    commands = Commands(UnopenedLines(), MAY)
+    until_ns = 10**12
+    assert await commands.write("mill", "setpoint", 10.0, CALLER, lambda what: until_ns) == DONE
+    assert len(deadlines) == 1
+    assert deadlines[0] <= until_ns
 
 
 @pytest.mark.parametrize(

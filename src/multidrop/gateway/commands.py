@@ -310,7 +310,8 @@ class Commands:
 
             The deadline is 0, so the command is not sent, if the drive was stopped after this call.
             """
-            return until_ns - boottime_ns() + now_ns() if self.stops[drive] == stops else 0
+            # now_ns() is called first, so that a pause between the two calls never makes the deadline later
+            return now_ns() + until_ns - boottime_ns() if self.stops[drive] == stops else 0
 
         def why_not() -> CommandResult | None:
             if self.stops[drive] == stops:
