@@ -584,6 +584,17 @@ async def test_command_log_keeps_records_in_order_until_closed(tmp_path: Path) -
     assert [line.partition('"step": ')[2] for line in lines] == ["0}", "1}", "2}", "3}", "4}"]
 
 
+async def test_command_logs_share_one_thread(tmp_path: Path) -> None:
+    """The thread never ends, so a thread for each client would use up the threads of the system."""
+    threads: list[int] = []
+    with patch.object(CommandLog, "_add", lambda *record: threads.append(threading.get_ident())):
+        for name in ("first", "second"):
+            log = CommandLog(tmp_path / name)
+            await log.note({})
+            log.close()
+    assert threads == [threads[0]] * 2
+
+
 async def test_command_log_refuses_records_while_too_many_wait_for_the_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -17,19 +17,19 @@ WRITING_S = 10.0  # time limit for writing a record; after it, the disk is repor
 MOST_WAITING = 1000  # limit of records that wait for the disk
 CLOSING_S = 1.0  # how long `close` waits for a record that is being written
 
+_thread = AsideThread("multidrop command log")  # one for all logs, because such a thread never ends
+
 
 class CommandLog:
     """A file with one line of JSON for each step of a command.
 
-    `note` returns once its line is on the disk, so that a caller can log a step before taking it. Records are
-    written in a thread of their own, so a disk that hangs blocks neither the event loop nor the exit of the
-    process.
+    `note` returns once its line is on the disk, so that a caller can log a step before taking it. A separate
+    thread writes the records, so a disk that hangs blocks neither the event loop nor the exit of the process.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self._log: AuditLog | None = None
-        self._thread = AsideThread("multidrop command log")
         self._is_closed = False
 
     def open(self) -> AuditLog:
@@ -47,7 +47,7 @@ class CommandLog:
         the disk answers.
         """
         written: Future[None] = Future()
-        if not self._thread.put(partial(self._write, written, record, time.time_ns()), MOST_WAITING):
+        if not _thread.put(partial(self._write, written, record, time.time_ns()), MOST_WAITING):
             raise OSError(f"{self.path}: {MOST_WAITING} records are already waiting; does the disk answer?")
         done = asyncio.wrap_future(written)
         # read the exception, because asyncio logs an error for one that is never read
@@ -77,5 +77,5 @@ class CommandLog:
     def close(self) -> None:
         """Wait until the record in progress is written, then close the file; later records are refused."""
         self._is_closed = True
-        if self._thread.flush(CLOSING_S) and self._log:
+        if _thread.flush(CLOSING_S) and self._log:
             self._log.close()
