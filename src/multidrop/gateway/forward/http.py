@@ -47,9 +47,9 @@ class UploadSettings:
     name: ClassVar[str] = "upload"
 
     def __post_init__(self) -> None:
-        refuse((*self._url_mistakes(), *parsing_mistakes(self, most=parse_size)))
+        refuse((*self._mistakes(), *parsing_mistakes(self, most=parse_size)))
 
-    def _url_mistakes(self) -> Iterator[str]:
+    def _mistakes(self) -> Iterator[str]:
         return url_mistakes(self.url, "https://plant.example/rows")
 
     def check(self, plant: Plant) -> Iterator[str]:
@@ -80,7 +80,7 @@ class InfluxSettings(UploadSettings):
 
     name: ClassVar[str] = "influx"
 
-    def _url_mistakes(self) -> Iterator[str]:
+    def _mistakes(self) -> Iterator[str]:
         wrong = [] if self.url == STDOUT else [*url_mistakes(self.url, InfluxSettings.url)]
         yield from wrong
         if not wrong and set(parse_qs(urlsplit(self.url).query).get("precision", ())) - {*NANOSECONDS}:
