@@ -187,7 +187,7 @@ class Reload:
         gateway.guarded("frames", gateway.frames.note_news)
 
     def without_changed_drives(self, batch: Batch) -> Batch:
-        """Return the batch without rows of changed drives that were requested before a reload has ended.
+        """Return the batch without rows of changed drives that were requested before the latest reload ended.
 
         It is unknown whether their values were polled with the old settings or with the new ones.
         """
