@@ -10,6 +10,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -386,15 +387,43 @@ async def test_a_stop_is_sent_when_too_many_broker_commands_are_in_progress() ->
     assert commands.begun[-1] == 99.0
 
 
-async def test_a_command_is_not_sent_after_its_age_limit(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The process may be suspended after the command's age was checked."""
-    monkeypatch.setattr(broker_commands, "boottime_ns", lambda: 100 * 10**9)
+def suspended(monkeypatch: pytest.MonkeyPatch, pause_ns: int) -> Callable[[], int]:
+    """Suspend the process for `pause_ns` after each read of a clock; return the clock of UTC in ms.
+
+    CLOCK_BOOTTIME begins at 100 s, and UTC at NOW_MS.
+    """
+    times_ns = count(100 * 10**9, pause_ns)
+    monkeypatch.setattr(broker_commands, "boottime_ns", lambda: next(times_ns))
+    return lambda: NOW_MS + next(times_ns) // 10**6 - 100_000
+
+
+@pytest.mark.parametrize("pause_ns", [0, 10**9])
+async def test_a_command_is_not_sent_after_its_age_limit(
+    monkeypatch: pytest.MonkeyPatch, pause_ns: int
+) -> None:
+    """The process may be suspended while the command's age is checked, or afterwards."""
     commands: Any = HeldCommands()
-    orders = BrokerCommands(commands, CALLER, lambda: NOW_MS, lambda *given: None)
+    orders = BrokerCommands(commands, CALLER, suspended(monkeypatch, pause_ns), lambda *given: None)
     orders.write("pump-1", "setpoint", 1.0, NOW_MS - 3_000)
     commands.go_on.set()
     await asyncio.gather(*asyncio.all_tasks() - {asyncio.current_task()})
-    assert commands.deadlines == [102 * 10**9]
+    assert commands.deadlines == [102 * 10**9 - pause_ns]
+
+
+@pytest.mark.parametrize("pause_ns", [0, 3 * 10**9])
+async def test_a_command_sent_before_a_stop_is_refused_after_a_pause(
+    monkeypatch: pytest.MonkeyPatch, pause_ns: int
+) -> None:
+    told: list[str] = []
+    commands: Any = HeldCommands()
+    commands.stopped_ns = lambda drive: 100 * 10**9
+    orders = BrokerCommands(
+        commands, CALLER, suspended(monkeypatch, pause_ns), lambda drive, what, end, _: told.append(end.text)
+    )
+    orders.write("pump-1", "setpoint", 1.0, NOW_MS - 100)
+    await asyncio.sleep(0)
+    assert commands.begun == []
+    assert told == ["not sent: the command may have been sent before the latest stop: send it again"]
 
 
 @pytest.mark.slow

@@ -93,37 +93,41 @@ class BrokerCommands:
         self._report(drive, what, CommandResult(CommandOutcome.FAILED, f"not sent: {why}"), command)
 
     @staticmethod
-    def _may_be_before(at_ns: int | None, age_ms: int) -> bool:
-        """Return True if a command with this age may have been sent before the time `at_ns`.
+    def _may_be_before(at_ns: int | None, now_ns: int, age_ms: int) -> bool:
+        """Return True if a command that is `age_ms` old at `now_ns` may have been sent before `at_ns`.
 
         The sender's clock may be ahead by MOST_AHEAD_MS. If `at_ns` is None, return False.
         """
         if at_ns is None:
             return False
-        return (boottime_ns() - at_ns) // 1_000_000 <= age_ms + MOST_AHEAD_MS
+        return (now_ns - at_ns) // 1_000_000 <= age_ms + MOST_AHEAD_MS
 
     def _admit(self, drive: str, what: str, command: object, time_ms: int, caller: Caller) -> float | None:
         """Return the deadline for sending a command (CLOCK_BOOTTIME, ns).
 
         If the command must not be sent, report why, and return None.
         """
+        now_ns = boottime_ns()  # read before UTC, so that a pause in between makes the command older
         age_ms = self._utc_ms() - time_ms
-        why = self._why_not(drive, command, age_ms)
+        why = self._why_not(drive, command, now_ns, age_ms)
         if why:
             self.refuse(drive, what, why, caller.command)
             return None
         self._came.append(command)
         self._under_way += 1  # counted before the task starts, because many commands may arrive at once
-        return boottime_ns() + (MOST_AGE_MS - age_ms) * 1_000_000
+        return now_ns + (MOST_AGE_MS - age_ms) * 1_000_000
 
-    def _why_not(self, drive: str, command: object, age_ms: int) -> str:
-        """Return why a command with this age must not be carried out; "" if it may be carried out."""
+    def _why_not(self, drive: str, command: object, now_ns: int, age_ms: int) -> str:
+        """Return why a command that is `age_ms` old now must not be carried out; "" if it may be.
+
+        `now_ns` is the present time of CLOCK_BOOTTIME.
+        """
         if not -MOST_AHEAD_MS <= age_ms <= MOST_AGE_MS:
             clocks = "by the clocks of sender and gateway"
             return f"the command was sent {age_ms / 1000:.1f} s ago {clocks}"
-        if self._may_be_before(self._commands.stopped_ns(drive), age_ms):
+        if self._may_be_before(self._commands.stopped_ns(drive), now_ns, age_ms):
             return "the command may have been sent before the latest stop: send it again"
-        if self._may_be_before(self._commands.plant_ns, age_ms):
+        if self._may_be_before(self._commands.plant_ns, now_ns, age_ms):
             return "the command may have been sent before the plant was reloaded: send it again"
         if command in self._came:
             return "the command is a copy of an earlier one"
