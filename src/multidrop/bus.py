@@ -246,7 +246,8 @@ class Bus:
         """
         line = {"baudrate": self.baudrate, "format": self.format, "silence": self.silence}
         attached = _made(drive, address, line, details)
-        attached.take_framing_of(self.line.port)
+        if attached is drive:
+            attached.take_settings(self.baudrate, self.format, self.silence, bus=self)
         self._attached.add(attached)
         return attached
 
@@ -436,7 +437,6 @@ def _made(drive: D | type[D], address: int | None, line: dict[str, Any], details
         raise TypeError(
             f"attach takes no address or options with a drive object; write them in {family.__name__}(…)"
         )
-    drive.take_settings(**line)
     return drive
 
 
@@ -461,7 +461,7 @@ class Attached:
     def add(self, drive: Drive) -> None:
         """Attach a drive. Raises ValueError if its address is taken, or if the drive is on another bus.
 
-        Raises LineError if this bus is closed.
+        Raises ValueError for a framing that the port cannot have, and LineError if this bus is closed.
         """
         with self.lock:
             if not self._bus.is_open:
@@ -476,7 +476,12 @@ class Attached:
                     f"{drive.name} is on the bus at {owner.line.port}: detach it there first, or create "
                     "another drive object"
                 )
-            self._exchanges.peers.add(drive)
+            try:
+                drive.take_framing_of(self._bus.line.port)
+                self._exchanges.peers.add(drive)
+            except BaseException:
+                del drive.bus
+                raise
             drive.bus = self._bus
             drive.stops_called = self._latches.add(drive).c
             drive.link = self._link

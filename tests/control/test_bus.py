@@ -150,6 +150,39 @@ def test_a_drive_uses_the_line_settings_of_the_bus_by_default() -> None:
         assert str(bus.attach(Toy(4, format="8E1")).settings) == "19200 8E1"
 
 
+def test_a_drive_without_settings_uses_those_of_its_present_bus() -> None:
+    drive = Toy(1)
+    with unpaced(simulated(Toy(1))) as sim:
+        for line, expected in ((19200, "19200 8N1"), (None, "9600 8N1")):
+            with Bus(path(sim), baudrate=line) as bus:
+                assert str(bus.attach(drive).settings) == expected
+
+
+def test_a_bus_does_not_change_the_settings_of_a_drive_that_it_refuses() -> None:
+    drive = Toy(1)
+    with unpaced(simulated(Toy(1, baudrate=19200))) as sim, Bus(path(sim), baudrate=19200) as bus:
+        bus.attach(drive)
+        other = Bus.awaiting("tcp://127.0.0.1:1")
+        other.baudrate = 9600
+        with other, pytest.raises(ValueError, match="toy@1 is on the bus at"):
+            other.attach(drive)
+        PlantLine("hall", "/dev/ttyUSB0", baudrate=9600, drives=[PolledDrive(drive)])
+        assert (drive.framing, str(drive.settings)) == (Framing.RTU, "19200 8N1")
+        assert drive.read("status") == 0
+
+
+def test_a_drive_can_be_attached_after_a_line_with_unsupported_settings() -> None:
+    drive = Toy(1)
+    with unpaced(simulated(Toy(1))) as sim:
+        for wrong in ({"baudrate": 300}, {"format": "7E1"}, {"baudrate": 19200, "silence": 1e-6}):
+            with (
+                Bus(path(sim), **cast(Any, wrong)) as bus,
+                pytest.raises(ValueError, match=r"300|7E1|silence"),
+            ):
+                bus.attach(drive)
+            assert (str(drive.settings), drive.agreed_silence) == ("9600 8N1", None)
+
+
 def test_a_drive_cannot_be_attached_to_a_closed_bus() -> None:
     with unpaced(simulated(Toy(1))) as sim, Bus(path(sim)) as bus:
         bus.close()

@@ -168,9 +168,7 @@ class Drive(RegisterAccess):
     @classmethod
     def _all_options(cls) -> Mapping[str, Option]:
         """Return the options of the class, with `confirmed` if its commands need it (`check_confirmed`)."""
-        commands = any(
-            register.commands or register.access is Access.COMMAND for register in cls.registers.values()
-        )
+        commands = any(one.commands or one.access is Access.COMMAND for one in cls.registers.values())
         verbs = any(getattr(cls, name) is not getattr(Drive, name) for name in MOVING)
         if not (commands or verbs) or (cls._identifies() and not cls.declared_in):
             return cls.options
@@ -194,9 +192,8 @@ class Drive(RegisterAccess):
             return cls.registers[name]
         except KeyError:
             if name in cls.texts:
-                raise ValueError(
-                    f"{name!r} of {cls._kind()} is a text, which can be read, but not polled or written"
-                ) from None
+                wrong = f"{name!r} of {cls._kind()} is a text, which can be read, but not polled or written"
+                raise ValueError(wrong) from None
             hint = did_you_mean(name, cls.registers, cls.model and f"see `multidrop models {cls.model}`", 3)
             raise ValueError(f"{cls._kind()} has no register {name!r}; {hint}") from None
 
@@ -209,9 +206,8 @@ class Drive(RegisterAccess):
     @classmethod
     def speaks(cls, framing: Framing) -> bool:
         """Return True if the family can use this framing: one of its own, or TCP if it uses Modbus."""
-        return framing in cls.framings or (
-            framing is Framing.TCP and any(one in MODBUS for one in cls.framings)
-        )
+        is_modbus = any(one in MODBUS for one in cls.framings)
+        return framing in cls.framings or (framing is Framing.TCP and is_modbus)
 
     @classmethod
     def formats_in(cls, framing: Framing) -> tuple[str, ...]:
@@ -238,7 +234,7 @@ class Drive(RegisterAccess):
         self.framing = self._framing(framing)
         self._declared_framing = None if framing is None else self.framing
         self._given = (baudrate, format, silence)
-        self._use(*first_given(self._given, (self.baudrates[0], self.formats_in(self.framing)[0], None)))
+        self._use(*self.settings_on(None, None, None))
         self.name = name or f"{self.model or type(self).__name__}@{address}"
         if not (isinstance(self.name, str) and self.name.isprintable()):  # a line break would split a row
             raise ValueError(f"the name {name!r} must be one line of printable characters")
@@ -297,27 +293,31 @@ class Drive(RegisterAccess):
             speaks_modbus=self.speaks(Framing.TCP),
         )
 
-    def take_settings(self, baudrate: int | None, format: str | None, silence: float | None = None) -> None:
-        """Use a line's settings for those that the drive was created without; None changes nothing.
+    def settings_on(self, *line: Any) -> tuple[Any, ...]:
+        """Return the drive's own baud rate, format and silence, else those of `line`, else the family's."""
+        return first_given(self._given, line, (self.baudrates[0], self.formats_in(self.framing)[0], None))
 
-        Raises ValueError for a setting that the family does not support.
+    def take_settings(self, *line: Any, bus: Any = None) -> None:
+        """Use `settings_on(*line)`. A drive on an open bus other than `bus` keeps the settings of that bus.
+
+        Raises ValueError for a setting that the family does not support; the drive then keeps its settings.
         """
-        now = (self.settings.baudrate, self.settings.format, self.agreed_silence)
-        wanted = first_given(self._given, (baudrate, format, silence), now)
-        if wanted != now:
-            self._use(*wanted)
+        if self.bus in (None, bus) or not self.bus.is_open:
+            wanted = self.settings_on(*line)
+            if wanted != (self.settings.baudrate, self.settings.format, self.agreed_silence):
+                self._use(*wanted)
 
     def _use(self, baudrate: int, format: str, silence: float | None) -> None:
-        self.settings = Settings(
+        settings = Settings(
             supported("baud rate", baudrate, self.baudrates, self._kind()),
             supported("format", format, self.formats_in(self.framing), self._kind()),
         )
-        self.agreed_silence = silence
         if silence is not None:
-            own = self._own_silence() if self.framing is Framing.RTU else None
-            check_agreed_silence(silence, self.settings, own)
+            own = self._own_silence(settings) if self.framing is Framing.RTU else None
+            check_agreed_silence(silence, settings, own)
+        self.settings, self.agreed_silence = settings, silence
         if self.response_delay_characters:
-            least = self.response_delay_characters * self.settings.character
+            least = self.response_delay_characters * settings.character
             self.response_delay = max(type(self).response_delay, least)
 
     def needed_silence(self) -> float:
@@ -325,12 +325,12 @@ class Drive(RegisterAccess):
         if self.framing is Framing.TCP:  # on Modbus TCP, the gateway keeps the silence
             return 0.0
         if self.framing is not Framing.RTU:
-            return self._own_silence()
+            return self._own_silence(self.settings)
         agreed = self.settings.t3_5 if self.agreed_silence is None else self.agreed_silence
-        return max(agreed, self._own_silence())
+        return max(agreed, self._own_silence(self.settings))
 
-    def _own_silence(self) -> float:
-        return max(self.silence, self.silence_characters * self.settings.character)
+    def _own_silence(self, settings: Settings) -> float:
+        return max(self.silence, self.silence_characters * settings.character)
 
     def __setattr__(self, name: str, value: object) -> None:
         if name in self.registers:

@@ -191,7 +191,7 @@ class PlantLine:
         object.__setattr__(self, "rs485", RS485(self.rs485))
         object.__setattr__(self, "drives", _all_of(PolledDrive, self.drives, "PlantLine", "drives"))
         for polled in self.drives:
-            polled.drive.take_settings(self.baudrate, self.format)
+            polled.drive.take_settings(self.baudrate, self.format, None)
 
     def at(self, port: str) -> PlantLine:
         """Return a copy of the line at another port, without `rs485` if the new port is a network port."""

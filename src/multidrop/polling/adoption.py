@@ -258,7 +258,9 @@ def _can_become(line: PolledLine, wanted: PlantLine) -> bool:
         (each.port, each.echo, each.transaction, each.rs485, each.settle) for each in (line.declared, wanted)
     )
     settings = line.bus.line.only_settings
-    wanted_settings = {(at.baudrate, at.format) for at in (polled.drive.settings for polled in wanted.drives)}
+    wanted_settings = {
+        polled.drive.settings_on(wanted.baudrate, wanted.format, None)[:2] for polled in wanted.drives
+    }
     return facts == others and (settings is None or wanted_settings <= {settings})
 
 

@@ -141,6 +141,7 @@ class PolledLine:
     ) -> None:
         self.declared = declared  # the line as declared; `polled` has the drives that are on it now
         self.bus = bus
+        bus.baudrate, bus.format = declared.baudrate, declared.format
         # s; duration of a change of the line's settings: declared, or measured at `end`
         self.switching = declared.switching
         self.started_ns = started_ns  # when polling started, also before a change of the line; 0: not yet
@@ -209,7 +210,7 @@ class PolledLine:
         for the end of its last exchange. Only then is it known whether a late reply of that drive may still
         come.
         """
-        polled.drive.take_settings(self.declared.baudrate, self.declared.format)
+        polled.drive.take_settings(self.declared.baudrate, self.declared.format, None, bus=self.bus)
         self.await_gone(polled.drive.address)
         # not under the lock, which polling needs: `require` may wait until a port is open
         settings = polled.drive.settings
