@@ -6,7 +6,7 @@ import json
 import math
 from enum import IntEnum, IntFlag
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from commands import Run as RunCommand
@@ -520,3 +520,8 @@ def test_a_text_with_one_character_per_register_is_in_the_low_bytes() -> None:
         version.encode("4.18.1")
     with pytest.raises(ValueError, match="a text has order = 'A'; it must be 'AB', 'BA' or 'B'"):
         Text(1, 1, order="A")
+
+
+def test_a_register_outside_a_class_or_with_a_wrong_table_has_a_repr() -> None:
+    assert repr(reading(5, "A")) == "<Register (no name): reading, holding register 5, A>"
+    assert repr(reading(5, table=cast(Any, 3))) == "<Register (no name): reading, 3 5>"

@@ -159,8 +159,9 @@ class Register(Generic[T]):
         return self.name
 
     def __repr__(self) -> str:
+        table = getattr(self.table, "name", self.table)  # a table of a wrong type is reported later
         unit = f", {self.unit}" if self.unit else ""
-        return f"<Register {self.name}: {self.access.value}, {self.table.name} {self.address}{unit}>"
+        return f"<Register {self.name or '(no name)'}: {self.access.value}, {table} {self.address}{unit}>"
 
     @property
     def title(self) -> str:
