@@ -7,12 +7,13 @@ from typing import Any
 
 import pytest
 from lines import line, plant, polled, until
-from toy import PatientToy, QuickToy
+from toy import PatientToy, QuickToy, Toy
 from two_lines import CURRENT, Blocked, TwoLines, note_writes, quick, runs, until_sampled
 
 from multidrop.bus import Bus
 from multidrop.control.outcome import Seen
 from multidrop.errors import LineError
+from multidrop.plant.model import Plant, PlantLine, PolledDrive
 from multidrop.poller import Poller
 from multidrop.transport.line import Line
 from multidrop.transport.open_port import OpenPort
@@ -188,3 +189,21 @@ def test_a_pending_request_without_a_reply_does_not_hold_up_a_change(both: TwoLi
         adopting.start(poller.adopt, plant(both.hall(1)))
         until(lambda: "pump-1" in poller)
         until_sampled(poller, "pump-1")
+
+
+def test_a_drive_in_python_keeps_its_own_settings_if_its_line_loses_them() -> None:
+    with Poller(
+        Plant([PlantLine("hall", "loop://", baudrate=19200, drives=[PolledDrive(Toy(1))])])
+    ) as poller:
+        made = Plant([PlantLine("hall", "loop://", drives=[PolledDrive(Toy(1, baudrate=19200))])])
+        assert poller.adopt(made) == {}
+        assert str(poller["toy@1"].settings) == "19200 8N1"
+
+
+def test_a_drive_in_python_takes_the_settings_of_its_changed_line() -> None:
+    drive = Toy(1)
+    with Poller(Plant([PlantLine("hall", "loop://", baudrate=19200, drives=[PolledDrive(drive)])])) as poller:
+        made = Plant([PlantLine("hall", "loop://", drives=[PolledDrive(drive)])])
+        assert str(drive.settings) == "19200 8N1"  # until `adopt`, because the drive is polled
+        assert poller.adopt(made) == {}
+        assert str(drive.settings) == "9600 8N1"

@@ -233,7 +233,7 @@ class Drive(RegisterAccess):
         self.address = supported("address", address, self.addresses, self._kind())
         self.framing = self._framing(framing)
         self._declared_framing = None if framing is None else self.framing
-        self._given = (baudrate, format, silence)
+        self.own_settings = (baudrate, format, silence)
         self._use(*self.settings_on(None, None, None))
         self.name = name or f"{self.model or type(self).__name__}@{address}"
         if not (isinstance(self.name, str) and self.name.isprintable()):  # a line break would split a row
@@ -295,7 +295,9 @@ class Drive(RegisterAccess):
 
     def settings_on(self, *line: Any) -> tuple[Any, ...]:
         """Return the drive's own baud rate, format and silence, else those of `line`, else the family's."""
-        return first_given(self._given, line, (self.baudrates[0], self.formats_in(self.framing)[0], None))
+        return first_given(
+            self.own_settings, line, (self.baudrates[0], self.formats_in(self.framing)[0], None)
+        )
 
     def take_settings(self, *line: Any, bus: Any = None) -> None:
         """Use `settings_on(*line)`. A drive on an open bus other than `bus` keeps the settings of that bus.
@@ -588,11 +590,8 @@ class Drive(RegisterAccess):
         yield
 
 
-# Names that a register must not have.
-TAKEN_NAMES = frozenset(
-    {*dir(Drive), *("address", "framing", "settings", "agreed_silence", "response_delay", "name")}
-    | {"option", "ram", "link"}
-)
+_OF_A_DRIVE = "address framing settings own_settings agreed_silence response_delay name option ram link"
+TAKEN_NAMES = frozenset({*dir(Drive), *_OF_A_DRIVE.split()})  # names that a register must not have
 
 
 def verbs_of(drive: Drive) -> list[str]:

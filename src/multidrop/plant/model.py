@@ -58,7 +58,7 @@ T = TypeVar("T")
 class Polled:
     """A register that is read every `every` seconds; None means as fast as the line allows.
 
-    A PolledDrive replaces a name by the drive's register, and "*" by all readings without an own entry.
+    A PolledDrive replaces a name by the drive's register, and "*" by all readings that have no other entry.
     Raises ValueError unless `every` is None or from 0.0001 to 86400 s.
     """
 

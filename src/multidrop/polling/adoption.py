@@ -87,6 +87,7 @@ def _description(drive: Drive) -> tuple[object, ...]:
         drive.name,
         drive.framing,
         drive.settings,
+        drive.own_settings,  # they decide which settings the drive has on another line
         drive.agreed_silence,
         drive.response_delay,
         drive.response_timeout,
