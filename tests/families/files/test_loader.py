@@ -342,6 +342,8 @@ WRONG_SECTIONS = [  # each text is a wrong section before a valid section [readi
     ("formats = { rtu = 5 }", "formats = {'rtu': 5}: 5 is not a list of formats"),
     ("formats = { rtu = ['8N1'], tcp = ['8N1'] }", "formats has 'tcp', which is not one of the framings rtu"),
     ("framings = ['rtu', 'ascii']\nformats = { rtu = ['8N1'] }", "formats has no list for ascii; add ascii"),
+    ("framings = ['rtu', 'ascii']\nformats = { ascii = ['7E1'] }", "formats has no list for rtu; add rtu"),
+    ("formats = {}", "formats has no list for rtu; add rtu"),
     ("read_together = [5]", "read_together = [5]: 5 is not a list of registers' names"),
     ("gaps = { inputs = [1, 2] }", "gaps has 'inputs', which is not a register table; write holding, input"),
     ("gaps = { input = 5 }", "gaps: input = 5 is not a list of a first and a last address"),

@@ -372,6 +372,8 @@ def _facts(tables: Sequence[str]) -> dict[str, Any]:
         "required": ["framings"],
         "properties": {"framings": {"contains": {"enum": ["ascii", "ASCII"]}}},
     }
+    # without the key, the framing is RTU
+    speaks_rtu = {"properties": {"framings": {"contains": {"enum": ["rtu", "RTU"]}}}}
     rtu_only = {"formats": {"anyOf": [eight_bits, _table({"rtu": eight_bits})]}}
     both = {"formats": {"properties": {"rtu": eight_bits}, "required": ["ascii"]}}
     facts = json_schema(
@@ -379,6 +381,7 @@ def _facts(tables: Sequence[str]) -> dict[str, Any]:
         allOf=[
             {"not": {"required": ["profile", "extends"]}},
             {"if": speaks_ascii, "then": {"properties": both}, "else": {"properties": rtu_only}},
+            {"if": speaks_rtu, "then": {"properties": {"formats": {"required": ["rtu"]}}}},
         ],
     )
     facts["properties"]["registers"] |= {"maxItems": MOST_CSV_FILES}
