@@ -241,8 +241,8 @@ class Bus:
         """Put a drive on the bus, and return it. `drive` is a family, with its arguments, or a drive object.
 
         No request is sent; the identity of the drive is checked before its first write. Any thread may call
-        this. Raises ValueError for an argument that the family does not allow, a taken address, or a drive on
-        another bus. Raises LineError if this bus is closed.
+        this. Raises ValueError for an argument, or a setting of this bus, that the family does not allow, for
+        a taken address, or a drive on another bus. Raises LineError if this bus is closed.
         """
         line = {"baudrate": self.baudrate, "format": self.format, "silence": self.silence}
         attached = _made(drive, address, line, details)
@@ -256,7 +256,6 @@ class Bus:
 
         The motor keeps running or standing. The drive's pending verbs raise CancelledByStop, or Unconfirmed
         if they were sent already. Waits for the drive's pending stops.
-
         """
         self._latches.remove(drive)
         with self._attached.lock:
