@@ -215,7 +215,7 @@ struct md_exchange {
     int64_t character_ns;          /* duration of a character on the wire */
     int64_t silence_ns;            /* silence kept before the request and after its reply */
     /* Lower bound of a write's timeout; 0: use the learnt timeout. With `insists`: instead, how long a stop
-     * may wait for a late reply. */
+     * may wait for a late reply; 0 also shows that it is a drive's first stop. */
     int64_t timeout_ns;
     int64_t period_ns; /* time between the exchange's slots in the queue; 0: no fixed period */
     /* An exchange to send first while it is unknown whether the adapter echoes. Its reply is never a copy of

@@ -134,6 +134,7 @@ void md_count_stop(uint32_t *stops)
 }
 
 enum {
+    FIRST_PART = 4,          /* first stops of silent drives wait for reads during 1/4 of a timeout */
     POLLED = 20,             /* polling gets 1/20 of a line that urgent requests keep busy */
     MOST_OWED_NS = 50000000, /* limit of owed_ns, the line time that polling may catch up on */
     STOPPING_NS = 20000000   /* time for a thread that stops several drives to add the next stop */
@@ -196,19 +197,36 @@ static int is_silent(const struct md_exchange *exchange)
     return exchange->drive->failures > 0;
 }
 
+/* Return 1 if stops of drives that answer, and their reads, precede this request: after an exchange with a
+ * silent drive, for as long as that exchange took. They would otherwise wait for the timeouts of all silent
+ * drives that are being stopped. */
+static int gives_way(const struct md_turn *turn, const struct md_exchange *exchange, int64_t now_ns)
+{
+    if (exchange->is_stop_read || (exchange->insists && !is_silent(exchange)))
+        return 0;
+    return now_ns < turn->missed_ns + turn->miss_ns;
+}
+
+/* Return 1 if reads must not precede this stop: the first stop of a silent drive waits for reads during
+ * 1/FIRST_PART of the latest timeout only, because the drive may be back, with a running motor. */
+static int precedes_reads(const struct md_turn *turn, const struct md_exchange *exchange, int64_t now_ns)
+{
+    int is_first = exchange->insists && !exchange->timeout_ns; /* repeated stops have a least timeout */
+    return is_first && now_ns >= turn->missed_ns + turn->miss_ns / FIRST_PART;
+}
+
 /* Move the first request that may be sent now to the front and return it; otherwise set wake_ns. While a stop
- * waits for its drive, send only other stops: the stop must not wait for further exchanges. After an exchange
- * with a silent drive, stops of drives that answer precede the other requests for as long as that exchange
- * took: they would otherwise wait for the timeouts of all silent drives that are being stopped. */
+ * waits for its drive, send only other stops: the stop must not wait for further exchanges. */
 static struct md_urgent *find_urgent(struct md_turn *turn, int *is_held, int64_t *wake_ns, int64_t now_ns)
 {
     struct md_urgent **found = NULL;
+    int are_reads_held = 0;
     for (struct md_urgent **at = &turn->urgent; *at; at = &(*at)->next) {
         const struct md_exchange *exchange = (*at)->exchange;
-        int is_preferred = now_ns >= turn->answering_ns || exchange->is_stop_read ||
-                           (exchange->insists && !is_silent(exchange));
-        if (!exchange->insists && *is_held)
+        int is_preferred = !gives_way(turn, exchange, now_ns);
+        if (!exchange->insists && (*is_held || are_reads_held))
             break;
+        are_reads_held |= precedes_reads(turn, exchange, now_ns);
         if (found && !is_preferred)
             continue;
         if (!is_time(later((*at)->not_before_ns, ready_ns(exchange)), wake_ns, now_ns)) {
@@ -281,8 +299,10 @@ static void stop_repeating(struct md_turn *turn)
 static void settle(struct md_turn *turn, int64_t took_ns, int64_t now_ns)
 {
     const struct md_exchange *exchange = turn->line.exchange;
-    if (is_silent(exchange) && turn->source != MD_AHEAD)
-        turn->answering_ns = now_ns + (exchange->is_stop_read ? 0 : took_ns);
+    if (is_silent(exchange) && turn->source != MD_AHEAD) {
+        turn->missed_ns = now_ns;
+        turn->miss_ns = exchange->is_stop_read ? 0 : took_ns;
+    }
     if (turn->source == MD_URGENT && exchange->insists)
         turn->stopping_ns = now_ns + STOPPING_NS;
     if (turn->source == MD_URGENT)
@@ -409,12 +429,12 @@ static void finish(struct md_turn *turn)
 }
 
 /* Put the postponed exchange back into its queue, because a stop must not wait for it. */
-static void give_way(struct md_turn *turn, int64_t now_ns)
+static void give_way(struct md_turn *turn)
 {
     int source = turn->source;
     md_line_put_back(&turn->line);
     turn->source = MD_NO_SOURCE;
-    turn->answering_ns = now_ns; /* otherwise a stop's read would be taken again */
+    turn->miss_ns = 0; /* otherwise a stop's read would be taken again */
     put_back(turn, source);
 }
 
@@ -425,7 +445,7 @@ int md_turn_want(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
         if (turn->source == MD_NO_SOURCE && !take(turn, wake_ns, now_ns))
             return MD_DONE;
         if (md_line_is_postponed(line) && is_stop_waiting(turn)) {
-            give_way(turn, now_ns);
+            give_way(turn);
             continue;
         }
         int want = md_line_want(line, now_ns);

@@ -8,7 +8,7 @@ import pytest
 from simulated_bus import EXCHANGE_TIME, STOPS, TIMEOUT, Own, SimulatedBus, che_drives
 
 from multidrop.control.outcome import Seen
-from multidrop.control.stops import PAUSE_S, SHARE
+from multidrop.control.stops import FIRST_PART, PAUSE_S, SHARE
 from multidrop.core import Message
 from multidrop.drive import Script, read, write
 from multidrop.drive.verbs import verb
@@ -95,6 +95,29 @@ def test_a_stop_that_reads_without_pause_leaves_half_of_the_line_to_stops_of_sil
     for address in (2, 3):
         times = [at for at, asked in sent if asked == address]
         assert max(later - earlier for earlier, later in pairwise(times)) < longest
+
+
+def test_first_stops_of_silent_drives_hardly_wait_for_reads_of_other_stops() -> None:
+    """A silent drive may be back, with a running motor. Stops of drives that answer are sent before."""
+    silent, last = range(1, 13), 13
+    line = SimulatedBus(simulated(Restless(last)))
+    for address in (*silent, last):
+        line.attach(Restless(address))
+    for drive in line.bus.drives[:-1]:
+        line.bus.peer(drive).c.failures = 3
+    first: dict[int, float] = {}
+
+    def note(request: Message) -> bool:
+        if request.function != 3:
+            first.setdefault(request.address, line.seconds)
+        return False
+
+    line.deafens = note
+    begun = line.seconds
+    line.bus.stop_all()
+    assert min(first, key=lambda address: first[address]) == last
+    step = 2 * MISS  # a read, which checks the drive's family, and the stop
+    assert max(first.values()) - begun < len(silent) * ((1 + FIRST_PART) * step + 2 * EXCHANGE_TIME)
 
 
 def test_drives_that_come_back_are_stopped_within_two_turns() -> None:

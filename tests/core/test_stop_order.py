@@ -15,9 +15,10 @@ MS = 1_000_000
 REPLY, TIMEOUT = 20 * MS, 100 * MS  # delay of a reply, and of a timeout, in ns
 SLACK = MS  # time of the frames and of the silences around them
 SILENT = 50  # drives at this address and above are silent
-# Registers: STOP stands for the write of a stop, STATUS for its reads, OTHER for other requests. All are read
-# here, because the reply to a write is a copy of it, which may also be the adapter's echo.
-STOP, STATUS, OTHER = 0x1000, 0x1001, 0x2000
+# Registers: STOP stands for the first write of a stop, AGAIN for its repetitions, STATUS for its reads, OTHER
+# for other requests. All are read here, because the reply to a write is a copy of it, which may also be the
+# adapter's echo.
+STOP, AGAIN, STATUS, OTHER = 0x1000, 0x1002, 0x1001, 0x2000
 
 Request = tuple[int, int]  # address of the drive, address of the register
 
@@ -67,8 +68,9 @@ class Line:
             format="8N1",
             character=1e-6,
             silence=1e-4,
-            insists=register == STOP,
+            insists=register in (STOP, AGAIN),
             is_stop_read=register == STATUS,
+            timeout=TIMEOUT / 1e9 if register == AGAIN else 0.0,
         )
 
     def run(self, until: int) -> Iterable[Request]:
@@ -116,14 +118,49 @@ def test_reads_of_a_stop_wait_for_one_silent_drive_and_not_for_all(answering: in
     """The drives are stopped from separate threads. Neither group leaves the other without its turns."""
     line = Line()
     addresses = [*range(1, 1 + answering), *range(SILENT, SILENT + silent)]
-    line.ask(*((address, STOP) for address in addresses))
+    line.ask(*((address, AGAIN) for address in addresses))
     for address, _ in line.run(60 * SECONDS):
-        line.ask((address, STOP if address >= SILENT else STATUS))
+        line.ask((address, AGAIN if address >= SILENT else STATUS))
     exchange = REPLY + SLACK
     reads = (TIMEOUT + SLACK) + (answering + 1) * exchange
     assert max(map(line.longest_pause, range(1, 1 + answering))) < 2 * reads
     turn = 2 * (TIMEOUT + SLACK) + exchange
     assert max(map(line.longest_pause, addresses[answering:])) < silent * turn
+
+
+def test_first_stops_of_silent_drives_hardly_wait_for_reads_of_other_stops() -> None:
+    """The reads never pause. A silent drive may be back, with a running motor."""
+    line, silent, answering = Line(), range(SILENT, SILENT + 12), range(1, 16)
+    line.ask(*((address, STOP) for address in (*silent, *answering)))
+    for address, _ in line.run(10 * SECONDS):
+        line.ask((address, AGAIN if address >= SILENT else STATUS))
+    first = {request: at for at, request in reversed(line.sent)}
+    exchange = REPLY + SLACK
+    turn = 5 / 4 * (TIMEOUT + SLACK) + exchange
+    assert max(first[address, STOP] for address in silent) < len(silent) * turn + len(answering) * exchange
+
+
+def test_reads_precede_the_first_stop_of_a_silent_drive_for_a_quarter_of_a_timeout() -> None:
+    line = Line()
+    line.ask((50, STOP), (51, STOP), (1, STATUS), (2, STATUS), (3, STATUS))
+    list(line.run(10 * SECONDS))
+    assert line.order() == [(50, STOP), (1, STATUS), (2, STATUS), (51, STOP), (3, STATUS)]
+
+
+def test_a_first_stop_behind_repeated_stops_precedes_reads() -> None:
+    line = Line()
+    line.ask((50, AGAIN), (51, AGAIN), (52, STOP), (1, STATUS), (2, STATUS), (3, STATUS))
+    list(line.run(10 * SECONDS))
+    first = [(50, AGAIN), (1, STATUS), (2, STATUS), (51, AGAIN)]
+    assert line.order()[:4] == first
+    assert line.order().index((52, STOP)) < 6
+
+
+def test_stops_precede_the_first_stop_of_a_silent_drive_for_a_whole_timeout() -> None:
+    line = Line()
+    line.ask((50, STOP), (51, STOP), *((address, STOP) for address in (1, 2, 3, 4)))
+    list(line.run(10 * SECONDS))
+    assert [address for address, _ in line.order()] == [50, 1, 2, 3, 4, 51]
 
 
 def test_a_new_stop_precedes_reads_of_other_stops() -> None:

@@ -41,17 +41,16 @@ LEAST_S = 30.0  # s; how long a stop is repeated by default
 PAUSE_S = 0.2  # s; pause before a stop is repeated
 LOOK_S = 0.002  # s; pause between checks whether a poller has reopened a lost port
 AT_ONCE = 8  # after this many steps without a good reply, a stop shares the line with polling
+FIRST_PART = 0.25  # part of a silent drive's timeout for which first stops of silent drives give way
 SHARE = 1.5  # polling then gets the line for this many times the duration of the stop's last step
 MOST_STEPS = 8  # limit of script steps when an interrupted stop is sent once more
 UNSENT = (WriteForbidden, LineError, NotMaster, ValueError)
 WORTH_REPEATING = (Unconfirmed, NotVerified, NoReply, BadReply, DriveException, PortLost, NotMaster)
 UNANSWERED = (Unconfirmed, NoReply, BadReply)
-# errors after which stops are retried: the system may soon have memory or descriptors again
-NO_ROOM = (MemoryError, OSError)
+NO_ROOM = (MemoryError, OSError)  # stops are retried: the system may soon have memory or descriptors again
 REGAIN_NS = 500_000_000  # interval between a failed attempt to reopen a lost port and the next one
 
 _log = logging.getLogger("multidrop.control")
-
 R = TypeVar("R")
 Do = Callable[["StopAttempt", Step], Any]
 
@@ -60,8 +59,8 @@ class StopAttempt:
     """One drive's stop, repeated until the drive confirms it and the motor is seen to stop.
 
     The stop is repeated for `seconds`. If `seconds` is None, no repetition starts after LEAST_S, and the last
-    one may take as long as the motor's ramp. After AT_ONCE steps without a good reply, the stop uses less
-    than half of the line's time, and leaves the rest to other requests.
+    one may take as long as the motor's ramp. After AT_ONCE steps without a good reply, the stop leaves more
+    than half of the line's time to other requests.
     """
 
     def __init__(
@@ -83,11 +82,10 @@ class StopAttempt:
         self.times_sent = 0  # number of stops sent, including those that the drive refused
         self._unanswered = 0  # number of steps without a good reply
         self._is_answered = False  # whether the drive has answered the latest write
-        self.others_first_until = begun  # time in s until which stops of drives that answer go first
+        self.miss = (begun, begun)  # start and end in s of the latest timeout, if this stop gives way then
         self.is_over = False
         self.ended = begun  # time in s at which the attempt ended
-        # SystemExit or similar, raised by the script; kept until all stops are over
-        self.interruption: BaseException | None = None
+        self.interruption: BaseException | None = None  # raised by the script; kept until all stops are over
         self.frame: Message | None = None  # the newest request of this stop
         self._times_in_doubt = 0  # number of frames that may or may not have been sent
         self._is_confirmed = False
@@ -185,21 +183,21 @@ class StopAttempt:
     def _share_line(self, begun: float, now: float) -> None:
         """After a step without a good reply, leave the line to other requests before the next step.
 
-        Stops that were answered go first for as long as the step took. After AT_ONCE such steps, other
-        requests get the line for longer, but not beyond the time limit of the stop.
+        After AT_ONCE such steps, delay the next step, but not beyond the time limit of the stop.
         """
         self._unanswered += 1
         if self.gives_way():
-            self.others_first_until = now + (now - begun)
+            self.miss = (begun, now)
         limit = LEAST_S if self._seconds is None else self._seconds
         due = now + SHARE * (now - begun)
         if self._unanswered > AT_ONCE and due < self._begun + limit:
             self.due = due
 
-    def gives_way(self) -> bool:
-        """Return True if the drive is silent and has not answered the latest write of this stop."""
+    def gives_way(self) -> float:
+        """Return for which part of a timeout this stop gives way; 0 unless the drive is silent."""
         peer = self._peers.get(self.drive)
-        return not self._is_answered and peer is not None and peer.failures > 0
+        is_silent = peer is not None and peer.failures > 0 and not self._is_answered
+        return (1.0 if self.frame else FIRST_PART) if is_silent else 0.0
 
     def next_at(self) -> float:
         """Return the time (in s) of the next step, including the pause that the drive needs."""
@@ -366,8 +364,7 @@ class StopRun:
         self._drives = drives
         self._make = make
         self._seconds = seconds
-        # sends a broadcast stop; None once it was called
-        self._broadcast: Callable[[], bool] | None = broadcast
+        self._broadcast: Callable[[], bool] | None = broadcast  # sends a broadcast stop; None once called
         self._tries = 0
         self.attempts: list[StopAttempt] = []
 
@@ -548,12 +545,15 @@ class Stopper:
 def _next(stops: Sequence[StopAttempt], now: float) -> StopAttempt:
     """Return the stop that is due first.
 
-    After a timeout of a silent drive, stops of drives that answer go first for as long as the timeout took.
-    Otherwise each of their reads would wait for the timeouts of all silent drives.
+    After a timeout, stops of drives that answer go first for as long as the timeout took: otherwise each of
+    their reads would wait for the timeouts of all silent drives. The first stop of a silent drive gives way
+    to reads for FIRST_PART of that time only, because the drive may be back, with a running motor.
     """
     due = [stop for stop in stops if stop.next_at() <= now]
-    if now < max(stop.others_first_until for stop in stops):
-        due = [stop for stop in due if not stop.gives_way()] or due
+    begun, ended = max(stop.miss for stop in stops)
+    due = [stop for stop in due if now >= ended + stop.gives_way() * (ended - begun)] or due
+    if now < ended + (ended - begun):
+        due = [stop for stop in due if not (stop.frame or stop.gives_way())] or due
     return min(due or stops, key=lambda stop: stop.next_at())
 
 
