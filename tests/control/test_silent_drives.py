@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import Any
 
 import pytest
 from simulated_bus import EXCHANGE_TIME, STOPS, TIMEOUT, Own, SimulatedBus, che_drives
 
 from multidrop.control.outcome import Seen
 from multidrop.control.stops import FIRST_PART, PAUSE_S, SHARE
-from multidrop.core import Message
+from multidrop.core import Completion, Exchange, Message
 from multidrop.drive import Script, read, write
 from multidrop.drive.verbs import verb
 from multidrop.sim import simulated
@@ -77,6 +78,22 @@ class Restless(Own):
         yield from write(self.run, 0)
         for _ in range(round(20 / EXCHANGE_TIME)):
             yield from read(self.speed)
+
+
+def test_a_stop_that_is_read_back_does_not_wait_for_silent_drives() -> None:
+    line = SimulatedBus(simulated(Restless(1)))
+    drive = line.attach(Restless(1))
+    line.bus.check_identity(drive)
+    carry_out, reads = line.carry_out, []
+
+    def note(exchange: Exchange, **details: Any) -> Completion:
+        if exchange.request.function == 3:
+            reads.append((exchange.request.start, exchange.c.is_stop_read))
+        return carry_out(exchange, **details)
+
+    line.carry_out = note  # type: ignore[method-assign]
+    drive.stop()
+    assert set(reads) == {(Restless.run.address, 1), (Restless.speed.address, 1)}
 
 
 def test_a_stop_that_reads_without_pause_leaves_half_of_the_line_to_stops_of_silent_drives() -> None:

@@ -275,7 +275,7 @@ class Writer:
             return None, None
         try:
             with call.look() if call else nullcontext():
-                return self._exchanges.value(drive, register), None
+                return self._exchanges.value(drive, register, is_stop_read=call is None), None
         except READ_FAILURES as failure:
             return None, failure
 
