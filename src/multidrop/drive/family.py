@@ -234,6 +234,7 @@ class Drive(RegisterAccess):
         self.framing = self._framing(framing)
         self._declared_framing = None if framing is None else self.framing
         self.own_settings = (baudrate, format, silence)
+        self._default_settings = (self.baudrates[0], self.formats_in(self.framing)[0], None)
         self._use(*self.settings_on(None, None, None))
         self.name = name or f"{self.model or type(self).__name__}@{address}"
         if not (isinstance(self.name, str) and self.name.isprintable()):  # a line break would split a row
@@ -295,9 +296,7 @@ class Drive(RegisterAccess):
 
     def settings_on(self, *line: Any) -> tuple[Any, ...]:
         """Return the drive's own baud rate, format and silence, else those of `line`, else the family's."""
-        return first_given(
-            self.own_settings, line, (self.baudrates[0], self.formats_in(self.framing)[0], None)
-        )
+        return first_given(self.own_settings, line, self._default_settings)
 
     def take_settings(self, *line: Any, bus: Any = None) -> None:
         """Use `settings_on(*line)`. A drive on an open bus other than `bus` keeps the settings of that bus.
