@@ -525,11 +525,14 @@ def test_a_reload_works_after_a_failed_reload(tmp_path: Path, monkeypatch: pytes
         def adopt(self, plant: Plant) -> None:
             raise RuntimeError("no plant")
 
-    with two_lines(tmp_path) as (gateway, _):
+    with two_lines(tmp_path) as (gateway, rows):
         gateway.gateway.feeds["deaf"] = Deaf()
         assert gateway.reload()["done"] is True
         assert gateway.gateway.failures["deaf"] > 0
         monkeypatch.setattr(gateway.gateway.poller, "adopt", lambda plant: 1 // 0)
+        edit(gateway, 'name = "fan-1"', 'name = "fan-2"')
         told = gateway.reload()
         assert (told["done"], told["mistakes"]) == (False, ["integer division or modulo by zero"])
         assert [one["done"] for one in gateway.post("/api/stop").json.values()] == [True, True]
+        failed_ns = now_ns()
+        until(lambda: any(drive == "fan-1" and at_ns > failed_ns for drive, _, at_ns in rows.found))

@@ -22,8 +22,9 @@ from spooled import NOON, numbered
 from tables import table
 
 from multidrop import PlantError
-from multidrop.gateway.forward.forwarder import MOST_ROWS, pieces, row_objects
-from multidrop.gateway.forward.http import line_protocol
+from multidrop.gateway.forward import http
+from multidrop.gateway.forward.forwarder import MOST_ROWS, Outgoing, pieces, row_objects
+from multidrop.gateway.forward.http import InfluxSettings, line_protocol
 from multidrop.gateway.http.rights import Right
 from multidrop.gateway.parts import missing_library
 from multidrop.gateway.settings import read_settings
@@ -204,6 +205,14 @@ def test_health_reports_lost_rows_until_the_backlog_is_sent(tmp_path: Path) -> N
         for name in ("rows_sent", "rows_lost", "rows_refused", "backlog_messages", "spool_bytes")
     }
     spool.close()
+
+
+def test_rows_for_influxdb_are_sent_with_a_token(monkeypatch: pytest.MonkeyPatch) -> None:
+    sent: list[dict[str, str]] = []
+    monkeypatch.setattr(http, "post", lambda url, body, headers: sent.append(headers))
+    rows = rows_at_noon(("pump-1", "status", 1.0, "ok", None))
+    InfluxSettings().sender("T0K3N", "plant")(Outgoing("1", rows, is_historical=False))
+    assert [one["authorization"] for one in sent] == ["Token T0K3N"]
 
 
 def test_stdout_rows_are_in_line_protocol(tmp_path: Path, capfdbinary: pytest.CaptureFixture[bytes]) -> None:

@@ -213,6 +213,7 @@ def test_values_are_stale_if_the_computer_slept_since_they_were_read(hub: Hub, c
     # the hub has not read its clock since the sleep
     clock.now_ns, clock.slept_ns = 11 * PERIOD + 1, 8 * 3600 * SECOND
     assert not is_fresh(hub)
+    assert hub.fresh("pump-1", "output_frequency") is None
     assert hub.seen("pump-1") == Shown("unknown", NOT_ASKED)
     assert not any(fresh for *_, fresh in hub.known("pump-1"))
     hub.take(all_of(11, FORWARD, 25))  # requested before the sleep and received after it
