@@ -294,13 +294,13 @@ def test_only_failed_work_is_logged_after_the_end_of_the_gateway(
             raise failure
 
     async def begin() -> None:
-        supervisor().thread("history", PATIENCE, work)
+        supervisor().thread("late work", PATIENCE, work)
 
     asyncio.run(begin())
-    [thread] = [one for one in threading.enumerate() if one.name == "multidrop history"]
+    [thread] = [one for one in threading.enumerate() if one.name == "multidrop late work"]
     go_on.set()
     thread.join(PATIENCE)
-    logged = ["history failed after the end of the gateway: the disk is broken"]
+    logged = ["late work failed after the end of the gateway: the disk is broken"]
     assert caplog.messages == (logged if failure else [])
 
 
