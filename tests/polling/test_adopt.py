@@ -516,11 +516,11 @@ def test_a_drive_name_keeps_its_code_in_all_batches() -> None:
         meant: dict[int, str] = {}
         for others in (*OTHERS, (yard(toy("pump-2", 3)),)):
             adopting = made.beside(lambda o=others: made.poller.adopt(plant(hall(pumps()[0]), *o)))
+            made.finish(adopting)
             with made._turn:
                 made._limit += S
                 made._turn.notify_all()
                 assert made._turn.wait_for(lambda: made._failure or made._rests, 60)
-            made.finish(adopting)
             while batch := made.poller.take():
                 columns = batch.columns()
                 for code in set(columns.drive):
