@@ -67,6 +67,25 @@ def test_each_drive_is_sent_its_stop_before_any_standstill_is_read() -> None:
     assert all(map(is_stop, first))
 
 
+def test_a_broadcast_does_not_replace_the_first_stop_of_a_drive() -> None:
+    """A first stop has no least timeout: it waits neither for late replies nor for reads of other stops."""
+    line, _ = running(3, 12)
+    carry_out = line.carry_out
+    least_timeouts: dict[int, list[int]] = {}
+
+    def note(exchange: Exchange, **details: Any) -> Completion:
+        if is_stop(exchange.request):
+            least_timeouts.setdefault(exchange.request.address, []).append(exchange.c.timeout_ns)
+        return carry_out(exchange, **details)
+
+    line.carry_out = note  # type: ignore[method-assign]
+    line.bus.stop_all()
+    assert 0 in least_timeouts  # the broadcast
+    for first, *repeated in (least_timeouts[address] for address in range(1, 16)):
+        assert first == 0
+        assert all(repeated)
+
+
 class Restless(Own):
     """A drive whose stop reads for 20 s without a pause."""
 

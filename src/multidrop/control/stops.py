@@ -497,7 +497,7 @@ class Stopper:
         if isinstance(step, Read):  # a read has one attempt: without a reply, the stop is sent again instead
             return self._exchanges.value(stop.drive, step.register, 1, is_stop_read=True)
         assert isinstance(step, Write)
-        timeout = WRITE_TIMEOUT if stop.is_sent else 0.0
+        timeout = WRITE_TIMEOUT if stop.frame else 0.0  # 0 also shows the core that it is the first stop
         try:
             return self._writer.insist(stop.drive, step, stop.checked, timeout, stop.note_frame).value
         finally:
