@@ -155,7 +155,6 @@ struct md_turn {
     uint32_t room;         /* number of slots, a power of two */
     uint32_t is_idle;      /* 1: the thread may sleep, so md_port_submit() must wake it */
     int64_t owed_ns;       /* line time that polling must still get, because urgent requests took it */
-    int64_t stopping_ns;   /* until then, polling gets only its share, because another stop may follow */
     int64_t missed_ns;     /* time at which the latest exchange with a silent drive ended */
     int64_t miss_ns;       /* duration of that exchange; 0 after a read of a stop */
     struct md_before before;

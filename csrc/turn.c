@@ -134,10 +134,9 @@ void md_count_stop(uint32_t *stops)
 }
 
 enum {
-    FIRST_PART = 4,          /* first stops of silent drives wait for reads during 1/4 of a timeout */
-    POLLED = 20,             /* polling gets 1/20 of a line that urgent requests keep busy */
-    MOST_OWED_NS = 50000000, /* limit of owed_ns, the line time that polling may catch up on */
-    STOPPING_NS = 20000000   /* time for a thread that stops several drives to add the next stop */
+    FIRST_PART = 4,         /* first stops of silent drives wait for reads during 1/4 of a timeout */
+    POLLED = 20,            /* polling gets 1/20 of a line that urgent requests keep busy */
+    MOST_OWED_NS = 50000000 /* limit of owed_ns, the line time that polling may catch up on */
 };
 
 static uint32_t pending(const struct md_turn *turn)
@@ -303,8 +302,6 @@ static void settle(struct md_turn *turn, int64_t took_ns, int64_t now_ns)
         turn->missed_ns = now_ns;
         turn->miss_ns = exchange->is_stop_read ? 0 : took_ns;
     }
-    if (turn->source == MD_URGENT && exchange->insists)
-        turn->stopping_ns = now_ns + STOPPING_NS;
     if (turn->source == MD_URGENT)
         turn->owed_ns += took_ns / (POLLED - 1);
     else if (turn->source != MD_AHEAD && turn->owed_ns > 0)
@@ -334,21 +331,13 @@ static int is_polling_due(const struct md_turn *turn)
     return !is_stop_waiting(turn) && turn->owed_ns > 0 && turn->last == MD_URGENT;
 }
 
-/* Return 1 if a polled exchange may start. One thread may stop several drives, one after the other. Polling
- * gets only its share until that thread has added the next stop, because a polled drive may be silent too. */
-static int may_poll(const struct md_turn *turn, const struct md_urgent *urgent, int64_t *wake_ns,
-                    int64_t now_ns)
-{
-    return is_polling_due(turn) || (!urgent && is_time(turn->stopping_ns, wake_ns, now_ns));
-}
-
 /* Start the next exchange and return 1; if no exchange is due yet, set wake_ns and return 0. */
 static int take(struct md_turn *turn, int64_t *wake_ns, int64_t now_ns)
 {
     int is_held = 0;
     *wake_ns = MD_NEVER;
     struct md_urgent *urgent = find_urgent(turn, &is_held, wake_ns, now_ns);
-    if (!is_held && may_poll(turn, urgent, wake_ns, now_ns) && take_polled(turn, wake_ns, now_ns))
+    if (!is_held && (!urgent || is_polling_due(turn)) && take_polled(turn, wake_ns, now_ns))
         return 1;
     if (urgent) {
         if (begin(turn, MD_URGENT, urgent->exchange, urgent->completion, now_ns) && is_overtaken(turn))

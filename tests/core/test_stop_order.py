@@ -33,7 +33,6 @@ class Line:
         self._reply: tuple[int, bytes] | None = None
         self._peers: dict[int, Peer] = {}
         self._pending: list[tuple[Any, Request]] = []
-        self._next: tuple[int, Request] | None = None  # a request that is added later, with its time
 
     def send(self, request: bytes, baudrate: int) -> None:
         _, message = parse_request(Framing.RTU, request)
@@ -47,14 +46,6 @@ class Line:
         """Add urgent requests to the queue, as if a thread were waiting for each."""
         for request in requests:
             self._pending.append((self.port.begin_urgent(self._exchange(*request)), request))
-
-    def ask_after(self, pause: int, request: Request) -> None:
-        """Add this request `pause` ns from now."""
-        self._next = self.now + pause, request
-
-    def repeat(self, request: Request) -> None:
-        """Poll this register without pause."""
-        self.port.repeat([self._exchange(*request)])
 
     def _exchange(self, address: int, register: int) -> Exchange:
         if address not in self._peers:
@@ -83,15 +74,12 @@ class Line:
                 if urgent.is_done:
                     self._pending.remove((urgent, request))
                     yield request
-            due = min(wake, *(each[0] for each in (self._reply, self._next) if each), NEVER)
+            due = min(wake, self._reply[0] if self._reply else NEVER)
             self.now = max(self.now, min(due, until))
             if self.now >= until:
                 return
             if self._reply and self._reply[0] <= self.now:
                 received, self._reply = self._reply[1], None
-            if self._next and self._next[0] <= self.now:
-                self.ask(self._next[1])
-                self._next = None
 
     def order(self) -> list[Request]:
         return [request for _, request in self.sent]
@@ -193,20 +181,3 @@ def test_a_read_of_a_stop_that_listens_for_another_master_lets_stops_pass() -> N
     list(line.run(10 * SECONDS))
     assert line.order() == [(50, STOP), (51, STOP), (1, STATUS)]
     assert line.sent[-1][0] >= SECONDS
-
-
-@pytest.mark.parametrize("polled", [2, 70], ids=["an answering drive", "a silent drive"])
-def test_polling_gets_a_small_share_while_one_thread_stops_silent_drives(polled: int) -> None:
-    """The thread adds each stop shortly after the previous one has ended."""
-    line = Line()
-    line.repeat((polled, OTHER))
-    line.ask((SILENT, STOP))
-    for address, _ in line.run(60 * SECONDS):
-        line.ask_after(2 * MS, (SILENT + (address + 1) % 10, STOP))
-    times = [at for at, _ in line.sent]
-    took = sum(
-        later - at
-        for (at, (address, _)), later in zip(line.sent, times[1:], strict=False)
-        if address == polled
-    )
-    assert 0.03 * 60 * SECONDS < took < 0.07 * 60 * SECONDS
