@@ -6,10 +6,10 @@ from itertools import pairwise
 from typing import Any
 
 import pytest
-from simulated_bus import EXCHANGE_TIME, STOPS, TIMEOUT, Own, SimulatedBus, che_drives
+from simulated_bus import EXCHANGE_TIME, STOPS, TIMEOUT, Own, SimulatedBus, che_drives, is_write
 
 from multidrop.control.outcome import Seen
-from multidrop.control.stops import FIRST_PART, PAUSE_S, SHARE
+from multidrop.control.stops import AT_ONCE, FIRST_PART, PAUSE_S, SHARE
 from multidrop.core import Completion, Exchange, Message
 from multidrop.drive import Script, read, write
 from multidrop.drive.verbs import verb
@@ -65,6 +65,15 @@ def test_each_drive_is_sent_its_stop_before_any_standstill_is_read() -> None:
     first = [request for _, request in sent if request.address][:15]  # without the broadcast
     assert [request.address for request in first] == [*range(1, 16)]
     assert all(map(is_stop, first))
+
+
+def test_a_drive_that_answers_no_reads_gets_no_more_stops_than_silent_drives() -> None:
+    line, sent = running(1, 12)
+    is_lost = line.deafens
+    line.deafens = lambda request: is_lost(request) or not is_write(request)
+    line.bus.stop_all()
+    fewest = min(len(stops(sent, address)) for address in range(2, 14))
+    assert len(stops(sent, 1)) < AT_ONCE + 2 * fewest
 
 
 def test_a_broadcast_does_not_replace_the_first_stop_of_a_drive() -> None:

@@ -196,8 +196,8 @@ class StopAttempt:
     def gives_way(self) -> float:
         """Return for which part of a timeout this stop gives way; 0 unless the drive is silent."""
         peer = self._peers.get(self.drive)
-        is_silent = peer is not None and peer.failures > 0 and not self._is_answered
-        return (1.0 if self.frame else FIRST_PART) if is_silent else 0.0
+        is_deaf = not self._is_answered or self._unanswered > AT_ONCE  # some drives answer only writes
+        return (1.0 if self.frame else FIRST_PART) if is_deaf and peer and peer.failures else 0.0
 
     def next_at(self) -> float:
         """Return the time (in s) of the next step, including the pause that the drive needs."""
