@@ -186,14 +186,14 @@ class StopAttempt:
         After AT_ONCE such steps, delay the next step, but not beyond the time limit of the stop.
         """
         self._unanswered += 1
-        if self.gives_way():
+        if self.part_given_way():
             self.miss = (begun, now)
         limit = LEAST_S if self._seconds is None else self._seconds
         due = now + SHARE * (now - begun)
         if self._unanswered > AT_ONCE and due < self._begun + limit:
             self.due = due
 
-    def gives_way(self) -> float:
+    def part_given_way(self) -> float:
         """Return for which part of a timeout this stop gives way; 0 unless the drive is silent."""
         peer = self._peers.get(self.drive)
         is_deaf = not self._is_answered or self._unanswered > AT_ONCE  # some drives answer only writes
@@ -545,15 +545,15 @@ class Stopper:
 def _next(stops: Sequence[StopAttempt], now: float) -> StopAttempt:
     """Return the stop that is due first.
 
-    After a timeout, stops of drives that answer go first for as long as the timeout took: otherwise each of
-    their reads would wait for the timeouts of all silent drives. The first stop of a silent drive gives way
-    to reads for FIRST_PART of that time only, because the drive may be back, with a running motor.
+    After a timeout, and for as long as it took, first stops of drives that answer precede all, and then their
+    reads, which would otherwise wait for the timeouts of all silent drives. The first stop of a silent drive
+    gives way to reads for FIRST_PART of that time only: the drive may be back, with a running motor.
     """
     due = [stop for stop in stops if stop.next_at() <= now]
     begun, ended = max(stop.miss for stop in stops)
-    due = [stop for stop in due if now >= ended + stop.gives_way() * (ended - begun)] or due
+    due = [stop for stop in due if now >= ended + stop.part_given_way() * (ended - begun)] or due
     if now < ended + (ended - begun):
-        due = [stop for stop in due if not (stop.frame or stop.gives_way())] or due
+        due = [stop for stop in due if not (stop.frame or stop.part_given_way())] or due
     return min(due or stops, key=lambda stop: stop.next_at())
 
 

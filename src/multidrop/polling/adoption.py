@@ -26,8 +26,7 @@ from multidrop.polling.polled_line import PolledLine
 
 
 def check_plant(plant: Plant, *, is_free: Callable[[Drive], bool]) -> None:
-    """Raise PlantError with all mistakes of a plant. The plant may come from a program instead of a plant
-    file.
+    """Raise PlantError with all mistakes of a plant, which may come from a plant file or from a program.
 
     `is_free` returns False for a drive that is on another bus. Each free drive takes the framing of its port.
     """
